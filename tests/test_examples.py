@@ -24,7 +24,7 @@ SHOWN_BY = {
     "torchgrasp.values.Certificate": "torchgrasp.plan.certify.certify",
     "torchgrasp.values.ContactCode": "torchgrasp.posture_model.encoding.encode",
     "torchgrasp.values.ContactPlan": "torchgrasp.plan.solve.plan_contacts",
-    "torchgrasp.values.IKSeeds": "torchgrasp.ik.posture_library.nearest_postures",
+    "torchgrasp.values.IKSeeds": "torchgrasp.ik.seeds.nearest_postures",
     "torchgrasp.values.ShapeEstimate": "torchgrasp.shape.gp.ShapeGP",
 }
 """Values that the library alone makes, and what makes them: its example reads one of their fields."""

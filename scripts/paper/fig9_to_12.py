@@ -31,10 +31,10 @@ from torchgrasp.app.report.stills import facing
 from torchgrasp.files import write_file
 from torchgrasp.geometry.frames import virtual_frame
 from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.ik.attempts import rank_seeds, refine_on_contacts
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
-from torchgrasp.ik.contact_first import rank_seeds, refine_on_contacts
-from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.shape.surface import Surface, extract_surface
 

@@ -33,7 +33,8 @@ from torchgrasp.export import (
     save_dexgraspbench,
     save_surface,
 )
-from torchgrasp.ik import Obstacles, collision_probability, lift_clearance
+from torchgrasp.ik import Obstacles
+from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.planner.problem import take_target
 from torchgrasp.scene import estimate_occupancy

@@ -28,7 +28,8 @@ from torchgrasp.cloud.prepare import clean_cloud
 from torchgrasp.control import ClosingReference, GraspController, measure, no_contact, observe, squeeze
 from torchgrasp.control.tactile import TipContact
 from torchgrasp.errors import BadArgument
-from torchgrasp.ik import CollisionWorld, IKSolution, Obstacles, PostureLibrary, nearest_postures, query_mixture
+from torchgrasp.ik import CollisionWorld, IKSolution, Obstacles, PostureLibrary, nearest_postures
+from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.plan import least_friction_forces
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface

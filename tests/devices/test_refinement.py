@@ -12,17 +12,11 @@ from tests.make import cup_view
 from tests.pinch import QUICK, cylinder, pinch
 from torchgrasp import ContactSpec, certify, fit_shape
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.ik import (
-    CollisionWorld,
-    Configuration,
-    GraspProblem,
-    PostureLibrary,
-    field_from_surface,
-    measure_errors,
-    nearest_postures,
-    solve_contact_first,
-    solve_joint,
-)
+from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.ik import CollisionWorld, GraspProblem, PostureLibrary, nearest_postures, solve_joint
+from torchgrasp.ik.attempts import solve_contact_first
+from torchgrasp.ik.candidates import measure_errors
+from torchgrasp.ik.configuration import Configuration
 from torchgrasp.shape import extract_surface
 
 SPEC = ContactSpec(table=0.0)

@@ -10,10 +10,10 @@ from tests.make import field_of_mesh
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.attempts import solve_contact_first
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
-from torchgrasp.ik.contact_first import solve_contact_first
-from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.posture_model.mixture import load_mixture
 from torchgrasp.values import Certificate, Contacts
 

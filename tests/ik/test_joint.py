@@ -9,13 +9,12 @@ from torchgrasp import ContactSpec, certify, fit_shape, load_hand, load_object, 
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.ik.attempts import assign, solve_contact_first
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import JointProblem, JointState, solve_joint
-from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
-from torchgrasp.ik.rounds import assign
+from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
 from torchgrasp.plan.flatness import flatness_constraint
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import normalise_tensions

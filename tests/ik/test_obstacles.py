@@ -10,17 +10,9 @@ import torch
 from torchgrasp import ContactSpec, certify, fit_shape, load_hand, load_object, plan_contacts
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply
-from torchgrasp.ik import (
-    CollisionWorld,
-    GraspProblem,
-    Obstacles,
-    PostureLibrary,
-    collision_probability,
-    field_from_surface,
-    lift_clearance,
-    nearest_postures,
-    solve_joint,
-)
+from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.ik import CollisionWorld, GraspProblem, Obstacles, PostureLibrary, nearest_postures, solve_joint
+from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.scene import Occupancy
 from torchgrasp.shape.surface import extract_surface
 

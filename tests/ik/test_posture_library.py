@@ -12,7 +12,7 @@ from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, collision_cost
-from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
+from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
 from torchgrasp.values import Contacts
 
 NOTHING = SignedDistanceField(torch.zeros(3, dtype=torch.float64), 1.0, torch.ones(2, 2, 2, dtype=torch.float64))

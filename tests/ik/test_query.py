@@ -12,7 +12,7 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.ik.query import WRONG_SIDE, query_mixture
+from torchgrasp.ik.seeds import WRONG_SIDE, query_mixture
 from torchgrasp.posture_model.encoding import PERMUTATIONS, encode_fingertips
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture

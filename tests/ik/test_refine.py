@@ -11,7 +11,7 @@ from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vecto
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.load import load_hand
-from torchgrasp.ik.checks import is_clear, measure_errors
+from torchgrasp.ik.candidates import is_clear, measure_errors
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
 from torchgrasp.ik.motion import find_approach

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.errors import Status
+from torchgrasp.ik.attempts import Attempts, assign
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.rounds import Attempts, assign
 from torchgrasp.values import Contacts, IKSeeds
 
 

@@ -10,7 +10,7 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.cobyla import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.posture_library import PostureLibrary
+from torchgrasp.ik.seeds import PostureLibrary
 from torchgrasp.ik.solve import solve_ik
 from torchgrasp.posture_model.mixture import load_mixture
 from torchgrasp.posture_model.sample import sample_configurations

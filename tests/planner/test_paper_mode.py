@@ -5,7 +5,7 @@ import torch
 
 from torchgrasp import ContactSpec, Status, load_hand, load_mixture, load_object, plan_grasps
 from torchgrasp.geometry.frames import apply, virtual_frame
-from torchgrasp.ik.checks import PAPER_TOLERANCE
+from torchgrasp.ik.candidates import PAPER_TOLERANCE
 from torchgrasp.ik.ranking import rank_by_variance
 from torchgrasp.posture_model.encoding import encode
 from torchgrasp.posture_model.mixture import PAPER_ENERGY

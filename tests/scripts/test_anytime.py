@@ -17,7 +17,7 @@ from benchmarks.anytime.single_start import least_weight
 from tests.pinch import pinch
 from torchgrasp import ContactSpec, certify, load_hand, load_object
 from torchgrasp.base import join
-from torchgrasp.ik.checks import measure_errors
+from torchgrasp.ik.candidates import measure_errors
 
 SPEC = ContactSpec(table=0.0)
 

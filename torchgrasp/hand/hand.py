@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -105,6 +105,11 @@ class Hand(Value):
         spheres, tips = self.collision_spheres, self.tips
         points = (spheres.link_index, spheres.center, 1.0), (tips.index, tips.center, 1.0)
         return FreeMotion.of(self.tree, self.actuated.coupling, [*points, (tips.index, tips.normal, 0.0)])
+
+    @functools.cached_property
+    def derived(self) -> dict[Any, Any]:
+        """Values that later stages derive from the hand, kept as long as the hand."""
+        return {}
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
-"""What grasp solvers are given, and how candidates become checked grasps."""
+"""What grasp solvers are given, and the checks that turn candidates into grasps; errors are measured by geometry."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Annotated
 
@@ -9,28 +10,34 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.checks import Length, Rows, checked
+from torchgrasp.checks import ANY, Length, Rows, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.checks import TIP_TOLERANCE, is_clear, measure_errors
-from torchgrasp.ik.clearance import CollisionWorld
-from torchgrasp.ik.configuration import Configuration
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance, obstacle_clearance
+from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import find_approach, motion_clearance
 from torchgrasp.ik.ranking import score
-from torchgrasp.ik.refine import open_hand
+from torchgrasp.ik.refine import open_hand, tip_targets
+from torchgrasp.plan.feasibility import first_violation
 from torchgrasp.values import Certificate, Contacts, Grasps, IKSeeds
 
 Reachable = Callable[[Tensor], Tensor]
-"""Tells which poses obj_from_hand (k, 4, 4) an arm reaches, as booleans (k,)."""
+"""Returns which poses obj_from_hand (k, 4, 4) an arm reaches, as booleans (k,)."""
+PAPER_TOLERANCE = 10 * MILLIMETRE
+"""Largest distance [m] of a tip from its contact in the paper's chain, about the radius of a tip."""
+TIP_TOLERANCE, TIP_PENETRATION = 1 * MILLIMETRE, 2 * MILLIMETRE
+"""Largest distance [m] of a tip from its contact, and largest depth of a tip in the estimated surface."""
+ANGLE_TOLERANCE = math.radians(2)
+"""Largest angle [rad] of a contact direction outside the pad's cone."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """A hand, certified contacts and the world; grasps around `center`, the object's centre [m], rank higher.
+    """A hand, certified contacts and the world. Grasps around `center`, the object's centre [m], rank higher.
 
-    Poses that `reachable` refuses are no grasps; None: every pose is reached.
+    Only poses that `reachable` accepts are grasps; None: every pose is reachable.
 
     Raises:
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.
@@ -61,12 +68,12 @@ class GraspProblem(Value):
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
-        """Return the seeds whose poses are reached."""
+        """Return the seeds with reachable poses."""
         return seeds if self.reachable is None else seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]
 
 
 def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
-    """Return which poses a user's callable reaches.
+    """Return which poses the user's callable reports as reachable.
 
     Raises:
         BadArgument: an answer of another kind than one boolean for each pose.
@@ -102,10 +109,76 @@ class GraspCandidates(Batch):
 
 
 @checked
+@dataclasses.dataclass(frozen=True)
+class GraspErrors(Batch):
+    """Errors of grasps; `Grasps` explains the fields.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> grasp = load_shipped_grasp("jug", "barrett")
+    >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
+    >>> found = measure_errors(load_hand("barrett"), placed, grasp.contacts, CollisionWorld(table=0.0))
+    >>> Status(int(found.status)).name, found.tip_error < 0.001, found.clearance > 0
+    ('OK', tensor([[True, True, True]]), tensor([True]))
+    """
+
+    tip_error: Annotated[Float[Tensor, "g f"], ANY]
+    normal_angle: Annotated[Float[Tensor, "g f"], ANY]
+    clearance: Annotated[Float[Tensor, "g"], ANY]
+    status: Int[Tensor, "g"]
+
+
+@checked
+def measure_errors(
+    hand: Hand,
+    configuration: Configuration,
+    contacts: Contacts,
+    world: CollisionWorld,
+    rolling: bool = True,
+    tolerance: Length = TIP_TOLERANCE,
+) -> GraspErrors:
+    """Measure grasps; `status` names the first error out of tolerance, NaN included.
+
+    Round fingertips may roll on their contacts within the pads' cones. If not `rolling`, the contact points of the pads
+    are measured, in any direction, as in the paper. `tolerance` [m] is the tolerance of tips.
+    """
+    spatial = SpatialJacobian.at(hand, configuration)
+    touching, target = (
+        (hand.tips.center, tip_targets(hand, contacts)) if rolling else (hand.tips.contact, contacts.points)
+    )
+    error = torch.linalg.vector_norm(spatial.points(hand.tips.index, touching) - target, dim=-1)
+    pads = spatial.pads.permute(2, 1, 0)
+    angle = torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))  # from the inward normal
+    links, depth, table = link_clearance(spatial, world, tips_touch=True)
+    between = hand.self_clearance(configuration.joints)
+    lower, upper = hand.lower.to(error), hand.upper.to(error)
+    cone = hand.tips.cone.to(error) + ANGLE_TOLERANCE
+    conditions = {
+        Status.TIP_ERROR: (error <= tolerance).all(1),
+        Status.NORMAL_ANGLE: (angle <= cone).all(1) | (not rolling),
+        Status.JOINT_LIMITS: ((configuration.joints >= lower - 1e-9) & (configuration.joints <= upper + 1e-9)).all(1),
+        Status.SELF_COLLISION: between >= 0,
+        Status.OBJECT_COLLISION: (links >= 0) & (depth >= -TIP_PENETRATION),
+        Status.TABLE_COLLISION: table >= 0,
+    }
+    clearances = [links, table, between]
+    if world.guarded:
+        clearances.append(obstacle_clearance(spatial, world))
+        conditions[Status.NEIGHBOUR_COLLISION] = clearances[-1] >= 0
+    return GraspErrors(error, angle, torch.stack(clearances).amin(0), first_violation(conditions))
+
+
+def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) -> Bool[Tensor, "g"]:
+    """Return which hands touch neither object nor table nor themselves, not even with their fingertips."""
+    links, _, table = link_clearance(SpatialJacobian.at(hand, configuration), world, tips_touch=False)
+    return (links >= 0) & (table >= 0) & (hand.self_clearance(configuration.joints) >= 0)
+
+
+@checked
 def check_candidates(
     problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
 ) -> Grasps:
-    """Return checked grasps (`measure_errors`); those right so far get pre-grasp and approach.
+    """Return checked grasps (`measure_errors`); grasps without an error get a pre-grasp and an approach.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -158,7 +231,7 @@ def check_candidates(
 def _keep_clear(
     problem: GraspProblem, configuration: Configuration, opened: Configuration, approach: Tensor, status: Tensor
 ) -> None:
-    """Name what obstacles prevent, in place; obstacles that may be touched only turn the approach where they can."""
+    """Mark in place the grasps that obstacles prevent; obstacles that may be touched only change the approach."""
     hand, world = problem.hand, problem.world
     crowded = torch.nonzero(status == Status.NO_APPROACH)[:, 0]
     direction, clearance = find_approach(hand, opened[crowded], world.alone)

@@ -1,29 +1,105 @@
-"""Clearances of links from the object, the table, obstacles and each other."""
+"""What links must not touch, and their clearances: from the object, the table, obstacles and each other."""
 
 import dataclasses
 import math
 from functools import cached_property
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, settle
+from torchgrasp.base import Value, check_number, settle
 from torchgrasp.checks import checked
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.ik.configuration import Rows, SpatialJacobian
-from torchgrasp.ik.obstacles import Obstacles
+from torchgrasp.scene.occupancy import Occupancy
 
 MILLIMETRE = 1e-3
-"""Unit of all residuals [m]: it makes lengths as large as angles times their weights."""
+"""Unit [m] of all residuals."""
 CLEARANCE = 4 * MILLIMETRE
-"""Clearance [m] that refinement asks of links and object or table; the checks accept any above zero."""
+"""Clearance [m] of links from object and table that refinement aims at; the checks accept any positive clearance."""
 SELF_CLEARANCE = 1 * MILLIMETRE
-"""Clearance [m] that refinement asks between links, whose shapes are exact."""
+"""Clearance [m] between links that refinement aims at; it is smaller, because shapes of links are exact."""
 HINGES = 8
-"""How many of the least clearances of each kind enter one step; the others are larger."""
+"""Number of least clearances of each kind that enter one step."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Obstacles(Value):
+    """Regions of a scene that are full with increasing probability, as distances [m] from them.
+
+    Args:
+        field: signed distances from the region that counts as full.
+        distances: unsigned distances from the regions of at least each of the `levels`, on the same grid.
+        levels: probabilities, ascending.
+        hard: whether links must not touch the full region; otherwise contact only lowers the predicted success.
+
+    >>> from torchgrasp import load_scene
+    >>> from torchgrasp.scene import estimate_occupancy
+    >>> scene = load_scene()
+    >>> obstacles = Obstacles.of(estimate_occupancy(scene, 1))
+    >>> neighbour = scene.cloud(2).points.double().mean(0)
+    >>> obstacles.likelihood(neighbour[None], torch.tensor([0.03]))
+    tensor(0.9000, dtype=torch.float64)
+    """
+
+    field: SignedDistanceField
+    distances: Float[Tensor, "k x y z"]
+    levels: Float[Tensor, "k"]
+    hard: bool = True
+
+    @classmethod
+    @checked
+    def of(cls, occupancy: Occupancy, full: float = 0.3, hard: bool = True) -> "Obstacles | None":
+        """Return the obstacles of an occupancy; voxels of probability `full` or more count as full. None: all is free.
+
+        Raises:
+            BadArgument: `full` outside [0.01, 1].
+        """
+        check_number("full", full, 0.01, 1.0)
+        device, occupancy = occupancy.origin.device, settle(occupancy, torch.device("cpu"))  # SciPy's distances
+        probability, levels = occupancy.probability, sorted({0.1, 0.5, 0.8, full})
+        if not bool((probability >= levels[0]).any()):
+            return None
+        distances = torch.stack([distance_to(probability >= level, occupancy.spacing) for level in levels])
+        outside, inside = distances[levels.index(full)], depth_in(probability >= full, occupancy.spacing)
+        field = SignedDistanceField(occupancy.origin.double(), occupancy.spacing, outside - inside)
+        return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64), hard).to(device)
+
+    @checked(gradients=True)
+    def likelihood(self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]) -> Float[Tensor, "*b"]:
+        """Return the largest probability of the regions that spheres [m] meet, as the middle between two levels."""
+        met = centres.new_zeros(centres.shape[:-2])
+        levels = [*self.levels.tolist(), 1.0]
+        for low, high, values in zip(levels, levels[1:], self.distances, strict=False):
+            hit = dataclasses.replace(self.field, values=values).nearest_node(centres) < radius
+            met = torch.where(hit.any(-1), (low + high) / 2, met)
+        return met
+
+
+def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
+    """Return the distances [m] of voxels from the faces of a region, 0 inside; an empty one is out of the grid."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not bool(region.any()):
+        return torch.full(region.shape, spacing * sum(region.shape), dtype=torch.float64)
+    steps = torch.from_numpy(np.asarray(distance_transform_edt(~region.numpy())))
+    return (spacing * (steps - 0.5)).clamp_min(0.0)
+
+
+def depth_in(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
+    """Return how deep [m] voxels lie in a region, 0 outside."""
+    depth = torch.zeros(region.shape, dtype=torch.float64)
+    if bool(region.any()):
+        where = torch.nonzero(region)  # only the box of the region is transformed
+        low, high = (where.amin(0) - 1).clamp_min(0).tolist(), (where.amax(0) + 2).tolist()
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        depth[box] = distance_to(~region[box], spacing)
+    return depth
 
 
 @checked
@@ -64,14 +140,14 @@ class CollisionWorld(Value):
 
     @property
     def guarded(self) -> bool:
-        """Tell whether there are obstacles that links may not touch."""
+        """Whether there are obstacles that links must not touch."""
         return self.obstacles is not None and self.obstacles.hard
 
 
 def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
     """Return the coordinates [m] of points along a plane's normal."""
     x, y, z = plane.components
-    if (x, y, z) == (0.0, 0.0, 1.0):  # the usual table costs nothing
+    if (x, y, z) == (0.0, 0.0, 1.0):  # a horizontal table
         return points[..., 2]
     return points[..., 0] * x + points[..., 1] * y + points[..., 2] * z
 

@@ -15,34 +15,29 @@ from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
-from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
-from torchgrasp.ik.checks import PAPER_TOLERANCE, TIP_PENETRATION
+from torchgrasp.ik.attempts import Attempts, assign, best_first, best_grasps, executable
+from torchgrasp.ik.candidates import (
+    PAPER_TOLERANCE,
+    TIP_PENETRATION,
+    GraspCandidates,
+    GraspProblem,
+    check_candidates,
+)
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.rounds import Attempts, assign, best_first, best_grasps, executable
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 
 ANGLE = 0.01
-"""Unit of the variables [rad]: a fingertip moves by a millimetre or less, the unit of distances."""
-FIRST_RADIUS, LAST_RADIUS = 10.0, 0.05
-"""Radius of the trust region in these units: at the start the error of a seed, at the end 0.05 mm at a fingertip."""
-EVALUATIONS = 400
-"""Most evaluations of one run; runs that reach their contacts need 100 to 350."""
-ROOM, FAR = 0.5, 20.0
-"""Clearance [mm] that the constraints ask for, since they are kept roughly; clearance above which none is told apart.
-The room left for a pre-grasp is no constraint, as in the paper."""
-WRONG = 1e3
-"""Distance [mm] of fingertips in a line, which have no virtual frame."""
-ENOUGH, RUNS, AT_ONCE, EACH = 10, 30, 5, 2
-"""Executable triples after which no more are tried; most runs, each a second with SciPy's COBYLA; triples tried at a
-time; runs for each triple, those whose seeds collide least."""
+"""Unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances."""
+FAR = 20.0
+"""Clearance [mm] above which clearances are not distinguished."""
 
 
 def refine_by_cobyla(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Return configurations of least tip distances, clear as far as each run gets; starting poses are not used."""
+    """Return the configurations at which COBYLA stops; only the joints of the starts are used."""
     if not len(configuration):
         return configuration
     rows = [CobylaRun(hand, q, p, world).solve() for q, p in zip(configuration.joints, contacts.points, strict=True)]
@@ -50,7 +45,7 @@ def refine_by_cobyla(
 
 
 class CobylaRun:
-    """One run from `joints` onto three points. SciPy asks for distance, then clearances: values are kept."""
+    """One run from `joints` onto three points. SciPy asks for distance and clearances in turn, so values are kept."""
 
     def __init__(self, hand: Hand, joints: Float[Tensor, "h"], points: Float[Tensor, "3 3"], world: CollisionWorld):
         self.hand, self.world = hand, world
@@ -75,13 +70,13 @@ class CobylaRun:
         return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.contact)[..., 0].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of the tip distances and what is left of each clearance [mm], which may not be negative."""
+        """Return the sum of the tip distances, and the clearances less half a millimetre, which must be >= 0 [mm]."""
         key = np.asarray(x).tobytes()
         if self.last is None or self.last[0] != key:
             _, frames, pose, framed = self.place(x)
             error = torch.linalg.vector_norm(apply(pose, self.tips(frames)) - self.points, dim=-1).sum() / MILLIMETRE
-            room = (torch.stack(self.clearances(frames, pose)) / MILLIMETRE).clamp_max(FAR) - ROOM
-            self.last = key, float(error) if framed else WRONG, room.cpu().numpy()
+            room = (torch.stack(self.clearances(frames, pose)) / MILLIMETRE).clamp_max(FAR) - 0.5
+            self.last = key, float(error) if framed else 1e3, room.cpu().numpy()
         return self.last[1:]
 
     def clearances(self, frames: Float[Tensor, "3 4 l 1"], pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, ""]]:
@@ -112,15 +107,18 @@ class CobylaRun:
             method="COBYLA",
             bounds=list(zip(*limits, strict=True)),
             constraints=[NonlinearConstraint(lambda x: self.evaluate(x)[1], 0.0, np.inf)],
-            tol=LAST_RADIUS,
-            options={"rhobeg": FIRST_RADIUS, "maxiter": EVALUATIONS},
+            tol=0.05,
+            options={"rhobeg": 10.0, "maxiter": 400},
         )
         joints, _, pose, _ = self.place(solution.x)
         return Configuration(joints[None], pose[None])
 
 
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp for each triple that was tried, in the order of rows, until `ENOUGH` are executable."""
+    """Return a checked grasp for each triple that was tried, best first.
+
+    Triples are tried five at a time, two seeds each, until 10 are executable or 30 were tried.
+    """
     seeds = problem.drop_unreachable(seeds)
     attempts, rows = Attempts(torch.ones_like(problem.certificate.closed), executable), seeds.row.unique()
 
@@ -131,17 +129,17 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
         candidates = GraspCandidates(configuration, contacts, certificate, seeds.permutation, status)
         return check_candidates(problem, candidates, rolling=False, tolerance=PAPER_TOLERANCE)
 
-    for some in rows.split(AT_ONCE):  # one empty part without rows
+    for some in rows.split(5):  # one empty part without rows
         chosen = seeds[torch.isin(seeds.row, some)]
-        attempts.refine(chosen, _rank(problem, chosen), [1] * EACH, refine)
+        attempts.refine(chosen, _rank(problem, chosen), [1, 1], refine)
         results = join(attempts.results)
-        if int(executable(results).sum()) >= ENOUGH or len(results) >= RUNS:
+        if int(executable(results).sum()) >= 10 or len(results) >= 30:
             break
     return best_first(best_grasps(attempts)[0])
 
 
 def _rank(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return each seed's rank within its triple: the least collision first."""
+    """Return each seed's rank within its triple by its deepest collision, the least first."""
     contacts, still = assign(problem.contacts, seeds), np.zeros(problem.hand.dof)
     runs = [CobylaRun(problem.hand, q, p, problem.world) for q, p in zip(seeds.joints, contacts.points, strict=True)]
     deepest = [max(0.0, -float(run.evaluate(still)[1].min())) for run in runs]

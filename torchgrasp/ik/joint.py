@@ -1,11 +1,11 @@
-"""Contacts, pose and joints solved together: contacts slide to where the hand reaches them.
+"""Contacts, pose and joints solved together: the contacts slide until the hand reaches them.
 
 The contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals are one least-squares
 problem. Its unknowns are pose, joints, contacts and tensions.
 """
 
 import dataclasses
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -16,13 +16,12 @@ from torchgrasp.base import Batch
 from torchgrasp.checks import checked
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.attempts import Attempts, assign, best_first, best_grasps, try_best_seeds
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
-from torchgrasp.ik.contact_first import refine_on_contacts
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.refine import HAND_STEP, ITERATIONS, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
-from torchgrasp.ik.rounds import Attempts, assign, best_first, best_grasps, executable
+from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.flatness import FlatnessConstraint, flatness_constraint
@@ -32,20 +31,14 @@ from torchgrasp.shape.values import SurfaceJet
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 
-FIXED_SEEDS, SLIDING_SEEDS, FEWER_SEEDS = 2, 8, 2
-"""Seeds of a row that are refined on fixed contacts, which costs little, and of an unsolved row with sliding ones. Of
-four or five contacts fewer: six more solve a tenth of the rows that are left, in as much time as all before."""
-SEEDS_AT_ONCE = 512
-"""Sliding seeds refined at once: their temporaries stay in the cache."""
 CONTACT_WEIGHT = 2.0
-"""Weight of a millimetre of the contact problem, whose checks forgive nothing: those of links forgive `CLEARANCE`.
-With 1 a fiftieth fewer grasps; with 4 and 8 more on solids and fewer on thin walls."""
+"""Weight of a millimetre of the contact problem: it is larger than 1, because contacts have no margins."""
 
 
 class Stage(NamedTuple):
-    """So many steps, with the constraint of flat surface or without, and the cost from which on a row is hopeless.
+    """A number of steps, whether the surface must be flat, and the cost [mm2] above which a row is dropped.
 
-    The constraint is linearised as its stage begins, which costs as much as two steps.
+    The constraint of flatness is linearised when the stage begins.
     """
 
     steps: int
@@ -54,15 +47,14 @@ class Stage(NamedTuple):
 
 
 STAGES = (Stage(5, False, 1e5), Stage(6, True, 1e4), Stage(7, True, 500.0), Stage(8, True, 50.0))
-"""Rows that end as grasps lie below these costs [mm2], but for a few in a hundred. On objects that are hard to grasp
-nine tenths of the rows lie above, and took two thirds of the time."""
+"""Few rows above these costs would end as grasps."""
 
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
     """Hands, their normalised contacts, and the tensions of the balance (`forces_from_tensions`).
 
-    The variance at the contacts is extrapolated from where a stage began: it costs more than all the rest.
+    The variance at the contacts is extrapolated linearly from the begin of a stage.
     """
 
     configuration: Configuration
@@ -116,7 +108,7 @@ class JointProblem:
     def _tips_by_points(
         self, spatial: SpatialJacobian, jet: SurfaceJet, outside: Bool[Tensor, "g f"]
     ) -> Float[Tensor, "g 4*f 3*f"]:
-        """Return the derivative of the tip residuals by the contacts; pads count `outside` their cones."""
+        """Return the derivative of the tip residuals by the contacts; pads count only `outside` their cones."""
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity, own = (torch.eye(k, dtype=normals.dtype, device=normals.device) for k in (3, len(hand.tips)))
         target = float(self.shape.scale) * identity + hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
@@ -145,7 +137,7 @@ class JointProblem:
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
         """Return hands and contacts that satisfy all constraints, as far as each row allows.
 
-        Contacts are normalised. Hopeless rows are left out: the last result holds the numbers of the others.
+        Contacts are normalised. Rows of high cost are dropped; the last result holds the numbers of the kept rows.
         """
         largest, radius = self.spec.flatness, self.spec.ring_radius
         rows, tension = torch.arange(len(points), device=points.device), equal_tensions(points)
@@ -168,21 +160,14 @@ class JointProblem:
         return configuration, points, rows
 
 
-def solve_fixed(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Attempts[Grasps]:
-    """Return attempts with the best seeds of each triple on its own contacts."""
-    attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
-    attempts.refine(seeds, rank_in_group(seeds.row), (FIXED_SEEDS,), partial(refine_on_contacts, problem, steps=steps))
-    return attempts
-
-
 def solve_sliding(
     problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec, attempts: Attempts[Grasps]
 ) -> None:
-    """Add attempts with sliding contacts for each triple that is unsolved so far."""
+    """Add attempts with sliding contacts for each unsolved row."""
     joint_problem = JointProblem(problem.hand, shape, spec, problem.world)
-    count = SLIDING_SEEDS if len(problem.hand.tips) == 3 else FEWER_SEEDS
+    count = 8 if len(problem.hand.tips) == 3 else 2
     chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, count)
-    for part in (chosen[k : k + SEEDS_AT_ONCE] for k in range(0, len(chosen), SEEDS_AT_ONCE)):
+    for part in (chosen[k : k + 512] for k in range(0, len(chosen), 512)):
         points = shape.normalise(assign(problem.contacts, part).points)
         start = Configuration(part.joints, part.obj_from_hand)
         configuration, points, left = joint_problem.solve(start, points)
@@ -195,9 +180,9 @@ def solve_sliding(
 
 @checked
 def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
-    """Return a checked grasp for each triple that has seeds, best first; contacts slide where they must.
+    """Return a checked grasp for each row with seeds, best first; contacts slide if the hand misses fixed contacts.
 
-    Seeds are tried in their order. Slid contacts are certified anew; their failures have a planning `Status`.
+    Seeds are tried in their order. Contacts that slid are certified again; their failures have a planning `Status`.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import PostureLibrary
@@ -211,6 +196,6 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
     tensor([0])
     """
     seeds = problem.drop_unreachable(seeds)
-    attempts = solve_fixed(problem, seeds)
+    attempts = try_best_seeds(problem, seeds)
     solve_sliding(problem, seeds, shape, spec, attempts)
     return best_first(best_grasps(attempts)[0])

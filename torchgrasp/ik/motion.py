@@ -1,4 +1,4 @@
-"""A whole grasp as a motion: the straight approach of the opened hand, closing and lift, clear of all else."""
+"""The motion of a grasp: the straight approach of the opened hand, the closing and the lift."""
 
 import math
 
@@ -11,23 +11,14 @@ from torchgrasp.geometry.frames import rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CollisionWorld, along
+from torchgrasp.ik.clearance import CollisionWorld, Obstacles, along
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.ik.obstacles import Obstacles
 from torchgrasp.values import Grasps
 
 APPROACH_DISTANCE = 0.1
-"""Length [m] of the straight path: about a hand's depth."""
-TILT, TILTED_DIRECTIONS = math.radians(45), 8
-"""Angle [rad] of the tilted directions to the hand's approach axis, halfway to sideways; one every 45 degrees."""
+"""Length [m] of the straight approach: about the depth of a hand."""
 COARSE_STEPS, FINE_STEPS = 8, 16
-"""Positions on every path, half a finger's width apart, and on a chosen one: corners stay within 1 mm of a link."""
-NODE_ERROR = 1.2
-"""Spacings by which `query` may lie below `nearest_node`: a cell's other nodes are on average 1.12 from the nearest."""
-CLOSING_STEPS = 6
-"""Postures from pre-grasp to grasp: fingertips move some 3 mm from one to the next."""
-LIFT, LIFT_STEPS = 0.1, 6
-"""Length [m] of the lift, and its positions: half a finger's width apart."""
+"""Positions on each candidate path, and on a chosen path."""
 
 
 def find_approach(
@@ -35,9 +26,8 @@ def find_approach(
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
     """Return a direction of approach for each pre-grasp, and the least clearance [m] of its path.
 
-    Candidates are the hand's approach axis, tilted directions and, above a table, straight down on it. The field's
-    nearest nodes rank their paths to 3 mm. The first path of non-negative interpolated clearance is taken, else the
-    clearest.
+    Candidates are the hand's approach axis, tilted directions and, above a table, straight down. The nearest nodes of
+    the field rank the paths. The first path of non-negative interpolated clearance is taken, or else the clearest path.
     """
     spheres = hand.collision_spheres
     centres = SpatialJacobian.at(hand, opened).sphere_centres
@@ -59,8 +49,9 @@ def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) 
     axis = unit(hand.approach.to(pose))
     first = unit(torch.linalg.cross(axis, torch.eye(3).to(axis)[axis.abs().argmin()]))
     second = torch.linalg.cross(axis, first)
-    angle = torch.arange(TILTED_DIRECTIONS).to(axis)[:, None] * (2 * math.pi / TILTED_DIRECTIONS)
-    tilted = math.cos(TILT) * axis + math.sin(TILT) * (torch.cos(angle) * first + torch.sin(angle) * second)
+    tilt, directions = math.radians(45), 8
+    angle = torch.arange(directions).to(axis)[:, None] * (2 * math.pi / directions)
+    tilted = math.cos(tilt) * axis + math.sin(tilt) * (torch.cos(angle) * first + torch.sin(angle) * second)
     directions = rotate(pose, torch.cat([axis[None], tilted]).expand(len(pose), -1, -1))
     if table is None:
         return directions
@@ -83,9 +74,9 @@ def _clearance(
     for field in world.fields:
         coarse = field.nearest_node(path) - radius
         near, first = coarse.min(1)
-        if exact:  # only spheres that may have the least clearance are interpolated
+        if exact:  # interpolate only spheres that may have the least clearance: nodes are up to 1.2 spacings away
             near = field.query(path[torch.arange(len(path), device=path.device), first])[0] - radius[first]
-            row, sphere = torch.nonzero(coarse < near[:, None] + NODE_ERROR * field.spacing, as_tuple=True)
+            row, sphere = torch.nonzero(coarse < near[:, None] + 1.2 * field.spacing, as_tuple=True)
             near = near.scatter_reduce(0, row, field.query(path[row, sphere])[0] - radius[sphere], "amin")
         least = torch.minimum(least, near)
     if world.plane is not None:
@@ -107,10 +98,10 @@ def motion_clearance(
 def collision_probability(
     hand: Hand, grasps: Grasps, obstacles: Obstacles, up: Float[Tensor, "3"] | None = None
 ) -> Float[Tensor, "g"]:
-    """Return how likely each hand meets something on its approach, while it closes, and on its lift.
+    """Return the probability of a collision of each hand on its approach, while it closes, and on its lift.
 
-    Hidden voxels are full together or free together: the same unseen extent of a thing decides. So the likeliest
-    voxel that a hand sweeps counts, not their number. `up` is the direction of the lift; None: z.
+    The unseen extent of one object decides whether its hidden voxels are full, so they are full or free together.
+    Therefore the largest probability among the swept voxels counts. `up` is the direction of the lift; None: z.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -133,7 +124,7 @@ def collision_probability(
 
 @checked
 def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles, up: Float[Tensor, "3"] | None = None) -> float:
-    """Return the least clearance [m] of a lifted surface from obstacles: far below zero if something lies on it.
+    """Return the least clearance [m] of a lifted surface from obstacles: far below zero if another object lies on it.
 
     >>> from torchgrasp import load_scene
     >>> from torchgrasp.scene import estimate_occupancy
@@ -148,7 +139,7 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles, up: Flo
 
 def _closing(hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"]) -> Float[Tensor, "g k s 3"]:
     """Return the spheres' centres [m] while the hand closes, at its pre-grasp and its grasp too."""
-    shares = torch.linspace(0, 1, CLOSING_STEPS).tolist()
+    shares = torch.linspace(0, 1, 6).tolist()
     postures = [torch.lerp(pregrasp, configuration.joints, share) for share in shares]
     return torch.stack([_centres(hand, Configuration(x, configuration.obj_from_hand)) for x in postures], 1)
 
@@ -159,8 +150,8 @@ def _lift(hand: Hand, configuration: Configuration, up: Float[Tensor, "3"]) -> F
 
 
 def _lifted(points: Float[Tensor, "*b 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "k *b 3"]:
-    """Return lifted points [m]."""
-    height = torch.arange(1, LIFT_STEPS + 1).to(points) * (LIFT / LIFT_STEPS)
+    """Return points [m] at six heights of a lift of 0.1 m."""
+    height = torch.arange(1, 7).to(points) * (0.1 / 6)
     return points + (height[:, None] * up.to(points)).reshape(-1, *[1] * (points.ndim - 1), 3)
 
 

@@ -1,7 +1,7 @@
-"""Which grasp to try first: a geometric score of candidates, a predicted probability of success of grasps.
+"""The order of grasps: a geometric score of candidates, and a predicted probability of success.
 
-`score` chooses among the candidates of a triple, a logistic model orders the executable grasps (docs/closing.md).
-`scripts/train.py success` fits it to trials of three fingertips, of the Allegro and the Barrett hand.
+`score` chooses among the candidates of one row of contacts. A logistic model orders executable grasps; it is fitted by
+`scripts/train.py success` to trials of the Allegro and the Barrett hand with three fingertips.
 """
 
 import dataclasses
@@ -23,22 +23,15 @@ from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ra
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import Contacts, Grasps
 
-OFFSET, PAD_ANGLE = 0.02, 0.8
-"""Offset [m] of the contacts' centre, and angle [rad] between contact direction and pad, that cost a point: choices."""
 FEATURES = (
     "log-odds of closure",
     "least friction angle of a balance over that of friction",
     "log of the load's arm over the triangle's height",
     "log of the stiffest finger's lever over 70 mm, at most",
 )
-"""What the model of success knows of a grasp, in this order."""
-LEAST_LEVER, LEAST_ARM = 0.01, 0.1
-"""Lever [m] of fingertips' torsion where three lie on one line; and an arm over the lever that turns nothing."""
-STRAIGHT_LEVER, FREE_LEVER = 0.01, 0.07
-"""Added to a lever [m], so that a straight finger's, which is 0, has a logarithm. And the lever above which more is no
-better: there 4 mm and 5 N m/rad are 4 N, the force itself. Skill on bodies left out: 0.218, without this 0.213."""
-SURFACE_DRAWS = 600
-"""Surfaces drawn for the probability of closure, whose error is then 0.02."""
+"""The features of the model of success, in this order."""
+LEAST_ARM = 0.1
+"""Added to the load's arm over the triangle's height, so that its logarithm is finite."""
 MODEL = Path(__file__).with_name("success.json")
 """Weights and bias of the model, and what they were fitted on."""
 
@@ -77,16 +70,16 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
 
 
 def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
-    """Return scores: central contacts, little friction and central pads are better."""
+    """Return scores: a point is lost by 20 mm off the centre, by a unit of friction, or by 0.8 rad off the pads."""
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
-    return -(offset / OFFSET + centred_friction(contacts) + normal_angle.amax(1) / PAD_ANGLE)
+    return -(offset / 0.02 + centred_friction(contacts) + normal_angle.amax(1) / 0.8)
 
 
 def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
     """Return the arm of a load at `center` about the longest side of each triangle, over the triangle's height.
 
     The object turns most easily about that side: only the third contact and torsion resist, by a lever of the height
-    and `LEAST_LEVER`. More contacts hold as well as the best three of them, at least.
+    and 10 mm for torsion. More contacts hold as well as the best three of them, at least.
 
     >>> triangle = torch.tensor([[[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.02, 0.0]]])
     >>> load_arm(triangle, torch.tensor([0.0, 0.0, 0.06]))
@@ -101,7 +94,7 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
     opposite = points.gather(1, (longest + 2) % 3)[:, 0]
     arm = torch.linalg.vector_norm(torch.linalg.cross(along, center - foot), dim=-1)
     height = torch.linalg.vector_norm(torch.linalg.cross(along, opposite - foot), dim=-1)
-    return arm / (height + LEAST_LEVER)
+    return arm / (height + 0.01)
 
 
 def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
@@ -139,14 +132,15 @@ def success_features(
     contacts = grasps.contacts
     points, normals = contacts.points.to(shape.x), contacts.normals.to(shape.x)
     center = center.to(points)
-    closure = torch.logit(closure_share(shape, contacts, friction, SURFACE_DRAWS, seed).to(points), eps=1e-3)
+    closure = torch.logit(closure_share(shape, contacts, friction, 600, seed).to(points), eps=1e-3)
     forces = least_friction_forces(points, normals, strongest=1.0)
     least = torch.atan(tangential_ratio(forces, normals).amax(-1)).nan_to_num(
         math.pi / 2
     )  # no balance: at any friction
     arm = torch.log(load_arm(points, center) + LEAST_ARM)
     least_lever = finger_levers(hand, grasps).amin(1).to(points)
-    lever = torch.log((least_lever.clamp_max(FREE_LEVER) + STRAIGHT_LEVER) / (FREE_LEVER + STRAIGHT_LEVER))
+    free, straight = 0.07, 0.01  # [m] more lever is no better; keeps the logarithm of a straight finger finite
+    lever = torch.log((least_lever.clamp_max(free) + straight) / (free + straight))
     return torch.stack([closure, least / math.atan(friction), arm, lever], dim=-1)
 
 

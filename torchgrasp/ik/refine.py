@@ -1,7 +1,7 @@
-"""Move hands onto their contacts and clear of all else: pose and joints by batched Levenberg-Marquardt.
+"""Move hands onto their contacts and away from everything else, by batched Levenberg-Marquardt on pose and joints.
 
-A round fingertip's centre comes to one radius off its contact, so the tip may roll; another tip touches with its
-contact point. The contact direction stays inside a cone about the pad's axis.
+The centre of a round fingertip is one radius off its contact, so the tip may roll. Other tips touch with their contact
+points. The contact direction stays inside a cone about the pad's axis.
 """
 
 import torch
@@ -15,17 +15,11 @@ from torchgrasp.ik.configuration import Configuration, Rows, SpatialJacobian, di
 from torchgrasp.values import Contacts
 
 TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0
-"""Weights of a tip's millimetre and of a cosine outside the cone. A millimetre of clearance weighs 1: contact wins."""
+"""Weights of a millimetre at a tip, and of a cosine outside the pad's cone; a millimetre of clearance weighs 1."""
 HAND_STEP = 0.6
-"""Largest step of a pose or a joint [m or rad]. With 0.3 three pairs of a flat object and a hand gave 415 grasps in
-place of 458, from as many steps."""
+"""Largest step of a pose or a joint [m or rad]."""
 ITERATIONS = 30
-"""Most steps of one refinement; a row that stalls stops earlier. Few rows take more, and each step costs its calls."""
-OPENING_ITERATIONS, OPENED = 12, 1.0
-"""Most steps to the pre-grasp, and its squared residuals [mm2] when done: half a millimetre is nothing there.
-Twice the steps to a tenth of the sum gave no grasp more on four objects."""
-OPENING, OPENING_SIGMAS = 0.012, 3.0
-"""Distance of the pre-grasp's tips from their contacts: metres, plus standard deviations of the surface there."""
+"""Most steps of one refinement."""
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
@@ -86,11 +80,11 @@ def refine(
 def open_hand(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Float[Tensor, "g h"]:
-    """Return the joints of the pre-grasp: the same pose, each tip off its contact along the normal, everything clear.
+    """Return the joints of the pre-grasp: each tip is off its contact along the normal, and every link is clear.
 
-    The opening grows with the surface's standard deviation, so a tip starts outside a larger object too.
+    The pose is the same. The distance is 12 mm plus three standard deviations of the surface.
     """
-    normals, gap = contacts.normals, OPENING + OPENING_SIGMAS * contacts.require_std()
+    normals, gap = contacts.normals, 0.012 + 3.0 * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
     if world.plane is not None:
         up, height = world.plane.normal.to(target), along(target, world.plane)[..., None]
@@ -102,7 +96,7 @@ def open_hand(
         return residual, jacobian[..., 6:]
 
     def integrate(state: Configuration, step: Float[Tensor, "a h"]) -> Configuration:
-        return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))  # the pose stays
+        return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))  # the pose is fixed
 
-    problem = LeastSquares(evaluate, integrate, OPENED, HAND_STEP)
-    return levenberg_marquardt(problem, configuration, OPENING_ITERATIONS)[0].joints
+    problem = LeastSquares(evaluate, integrate, solved=1.0, largest=HAND_STEP)  # half a millimetre at a tip
+    return levenberg_marquardt(problem, configuration, steps=12)[0].joints

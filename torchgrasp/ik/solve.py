@@ -16,27 +16,22 @@ from torchgrasp.checks import ANY, check_tensor, checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.checks import measure_errors
+from torchgrasp.ik.attempts import Attempts, assign
+from torchgrasp.ik.candidates import measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.cobyla import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
-from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import refine
-from torchgrasp.ik.rounds import Attempts, assign
+from torchgrasp.ik.seeds import PostureLibrary, nearest_postures, query_mixture
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Contacts, IKSeeds
 
 Method = Literal["levenberg_marquardt", "cobyla"]
 
-SEEDS_PER_ASSIGNMENT = 2
-"""Seeds of the learned model for each assignment: the conditional mean (Eq. 23) and the likeliest component's."""
-LEARNED_ATTEMPTS, LIBRARY_ATTEMPTS = 4, 8
-"""Seeds of the learned model and of the posture library that are refined before a row is given up."""
-EXACT, EXACT_TIPS = 1e-6, 5e-5
-"""Sum of squared residuals [mm2] at which a seed is done, and tip error [m] above which further seeds are tried."""
+EXACT = 1e-6
+"""Sum of squared residuals [mm2] at which a seed is done."""
 
 
 @checked
@@ -107,6 +102,8 @@ def solve_ik(
     library = None if library is None else settle(library, device)
     move = refine_by_cobyla if method == "cobyla" else refine_exactly
 
+    library_attempts = 8
+
     def refine_seeds(seeds: IKSeeds) -> IKSolution:
         parts = []
         for part in (seeds[k : k + 512] for k in range(0, max(len(seeds), 1), 512)):  # temporaries stay in the cache
@@ -119,17 +116,17 @@ def solve_ik(
         return join(parts)
 
     def library_seeds(some: Contacts) -> IKSeeds:
-        return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, LIBRARY_ATTEMPTS)
+        return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, library_attempts)
 
     def is_exact(solution: IKSolution) -> Bool[Tensor, "k"]:
-        return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= EXACT_TIPS)
+        return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= 5e-5)
 
     attempts = Attempts(~degenerate(contacts.points), is_exact)
     attempts.add(_no_solution(hand, contacts), torch.arange(len(contacts), device=contacts.points.device))
-    sources = [(library_seeds, LIBRARY_ATTEMPTS)]
+    sources = [(library_seeds, library_attempts)]
     if mixture is not None:
-        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=SEEDS_PER_ASSIGNMENT)
-        sources = [(learned_seeds, LEARNED_ATTEMPTS), *sources]
+        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=2)  # mean and mode
+        sources = [(learned_seeds, 4), *sources]
     for source, count in sources:
         rows = torch.nonzero(attempts.unsolved)[:, 0]
         if len(rows):

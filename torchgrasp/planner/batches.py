@@ -9,9 +9,9 @@ import torch
 
 from torchgrasp.base import count_status, join
 from torchgrasp.errors import Status
+from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_contact_first
 from torchgrasp.ik.cobyla import solve_as_paper
-from torchgrasp.ik.contact_first import solve_contact_first
-from torchgrasp.ik.joint import solve_fixed, solve_sliding
+from torchgrasp.ik.joint import solve_sliding, try_best_seeds
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.ik.ranking import (
     lexical_order,
@@ -21,7 +21,6 @@ from torchgrasp.ik.ranking import (
     success_log_odds,
 )
 from torchgrasp.ik.refine import ITERATIONS
-from torchgrasp.ik.rounds import Attempts, best_grasps, executable
 from torchgrasp.plan.solve import plan_in_turn
 from torchgrasp.plan.starts import check_starts
 from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
@@ -143,7 +142,7 @@ class Planner:
         """Return grasps on fixed contacts, the contacts without a grasp, and the best failures of these."""
         reach = self.problem.reach(found.contacts, found.certificate)
         found = found._replace(seeds=reach.drop_unreachable(found.seeds))
-        grasps, row = best_grasps(solve_fixed(reach, found.seeds, steps))
+        grasps, row = best_grasps(try_best_seeds(reach, found.seeds, steps))
         solved = executable(grasps)
         return grasps[solved], found.select(row[~solved]), grasps[~solved]
 

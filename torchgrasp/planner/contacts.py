@@ -12,10 +12,9 @@ from torchgrasp.base import join
 from torchgrasp.checks import Count, checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.linalg import farthest_points
-from torchgrasp.ik.contact_first import seed_costs
-from torchgrasp.ik.posture_library import nearest_postures
-from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.attempts import seed_costs
 from torchgrasp.ik.ranking import LEAST_ARM, load_arm, rank_in_group
+from torchgrasp.ik.seeds import nearest_postures, query_mixture
 from torchgrasp.plan.certify import certify
 from torchgrasp.planner.problem import Problem
 from torchgrasp.posture_model.mixture import PAPER_ENERGY

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import settle
 from torchgrasp.checks import Count, Range, Seed, checked
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.errors import BadArgument
@@ -22,10 +23,9 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import with_fingers
 from torchgrasp.ik.candidates import GraspProblem, Reachable
-from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
-from torchgrasp.ik.obstacles import Obstacles
-from torchgrasp.ik.posture_library import PostureLibrary
+from torchgrasp.ik.seeds import PostureLibrary
 from torchgrasp.plan.problem import walls_of
 from torchgrasp.plan.starts import Settled, settle_flatness
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
@@ -111,8 +111,11 @@ def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tu
     if fingers == "auto":
         if mode != "joint":
             raise BadArgument("fingers", f"'auto' in mode {mode!r}", "mode 'joint'")
-        found = (hand, *(with_fingers(hand, option) for option in hand.source.options))
-        return tuple({one.finger_names: one for one in reversed(found)}.values())[::-1]
+        if "finger sets" not in hand.derived:
+            found = (hand, *(with_fingers(hand, option) for option in hand.source.options))
+            distinct = {one.finger_names: one for one in reversed(found)}
+            hand.derived["finger sets"] = tuple(distinct.values())[::-1]
+        return hand.derived["finger sets"]
     chosen = hand if fingers is None else with_fingers(hand, fingers)
     if mode != "joint":
         chosen.require_three("mode", repr(mode))
@@ -158,12 +161,12 @@ class Problem:
             shape = request.shape.moved(inverse(frame))
         scene = None if scene is None else scene.to_upright(frame)
         mixture = None if mixture is None else mixture.to(shape.device)
-        return cls(request, hand.to(shape.device), cloud, spec, frame, shape, scene, mixture, mixture_sha256)
+        return cls(request, settle(hand, shape.device), cloud, spec, frame, shape, scene, mixture, mixture_sha256)
 
     def for_hand(self, hand: Hand, observer: Observer) -> "Problem":
         """Return the problem of another set of fingers, with another observer."""
         request = dataclasses.replace(self.request, observer=observer)
-        return dataclasses.replace(self, request=request, hand=hand.to(self.shape.device))
+        return dataclasses.replace(self, request=request, hand=settle(hand, self.shape.device))
 
     @cached_property
     def flat(self) -> Settled:

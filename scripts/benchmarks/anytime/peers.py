@@ -4,17 +4,18 @@ import dataclasses
 import math
 import time
 
+from torchgrasp.ik.rounds import assign
+
 from benchmarks.anytime.course import Course
 from benchmarks.anytime.single_start import SingleStart
 from benchmarks.common import Row
 from torchgrasp import ContactSpec, Hand, PointCloud, ShapeGP, Status, certify
 from torchgrasp.ik import IKSeeds
-from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
-from torchgrasp.ik.checks import measure_errors
+from torchgrasp.ik.attempts import assign
+from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates, measure_errors
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.rounds import assign
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.solver import project

@@ -24,11 +24,11 @@ from torchgrasp import (
 )
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.ik.attempts import assign
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
 from torchgrasp.ik.refine import refine
-from torchgrasp.ik.rounds import assign
+from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
 from torchgrasp.posture_model.em import expectation, maximisation
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.shard import Shard

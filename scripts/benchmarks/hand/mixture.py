@@ -19,7 +19,7 @@ from benchmarks.common import Row, least_seconds, peak_mib
 from benchmarks.hand.query import touched
 from benchmarks.hand.reach import planned_postures
 from torchgrasp import load_hand, load_mixture
-from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.posture_model.em import Progress, expectation, expectation_maximisation, maximisation
 from torchgrasp.posture_model.encoding import encode_fingertips
 from torchgrasp.posture_model.fit import fit_mixture

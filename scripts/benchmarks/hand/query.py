@@ -19,14 +19,13 @@ from torchgrasp import Contacts, load_hand, load_mixture
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik import cobyla
-from torchgrasp.ik.checks import TIP_TOLERANCE
+from torchgrasp.ik.attempts import assign
+from torchgrasp.ik.candidates import TIP_TOLERANCE
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.ik.posture_library import PostureLibrary
-from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.ranking import rank_in_group
-from torchgrasp.ik.rounds import assign
-from torchgrasp.ik.solve import LEARNED_ATTEMPTS, SEEDS_PER_ASSIGNMENT, IKSolution, solve_ik
+from torchgrasp.ik.seeds import PostureLibrary, query_mixture
+from torchgrasp.ik.solve import IKSolution, solve_ik
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.posture_model.sample import sample_configurations
 
@@ -85,7 +84,7 @@ def _solved_row(hand: str, what: str, solution: IKSolution, seconds: float, bar:
     error = 1e3 * solution.tip_error.amax(1).nan_to_num(torch.inf)
     share, median = float(solved.double().mean()), float(error.median())
     right = float(ok.double().mean())
-    learned = float((ok & (solution.attempts <= LEARNED_ATTEMPTS)).double().mean())
+    learned = float((ok & (solution.attempts <= 4)).double().mean())
     by_model = f", {learned:.2%} by the learned model's starts alone" if bar else ""
     wanted = "none"
     if bar is not None:
@@ -103,7 +102,7 @@ def _solved_row(hand: str, what: str, solution: IKSolution, seconds: float, bar:
 
 def _cobyla_row(hand: Hand, mixture: GraspMixture, contacts: Contacts, ours: IKSolution, seconds: float) -> Row:
     """Return the row of COBYLA from the first seed alone, one try a code."""
-    seeds, asked = timed(lambda: query_mixture(hand, contacts, mixture, n_seeds=SEEDS_PER_ASSIGNMENT))
+    seeds, asked = timed(lambda: query_mixture(hand, contacts, mixture, n_seeds=2))
     seeds = seeds[rank_in_group(seeds.row) == 0]
     taken, start = assign(contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
     spent, evaluate = [0.0], cobyla.CobylaRun.evaluate

@@ -19,13 +19,12 @@ from torchgrasp import (
     plan_contacts,
 )
 from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.ik.attempts import rank_seeds
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
-from torchgrasp.ik.contact_first import rank_seeds
 from torchgrasp.ik.joint import solve_joint
-from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
-from torchgrasp.ik.query import query_mixture
 from torchgrasp.ik.ranking import lexical_order
+from torchgrasp.ik.seeds import PostureLibrary, nearest_postures, query_mixture
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import IKSeeds
 

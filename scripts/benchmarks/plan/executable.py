@@ -18,13 +18,11 @@ from benchmarks.ground_truth import read_views
 from torchgrasp import ContactSpec, Grasps, Hand, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.signed_distance import field_from_surface
-from torchgrasp.ik.candidates import GraspProblem
-from torchgrasp.ik.checks import TIP_PENETRATION
+from torchgrasp.ik.attempts import solve_contact_first
+from torchgrasp.ik.candidates import TIP_PENETRATION, GraspProblem
 from torchgrasp.ik.clearance import CLEARANCE, SELF_CLEARANCE, CollisionWorld
-from torchgrasp.ik.contact_first import solve_contact_first
 from torchgrasp.ik.joint import solve_joint
-from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
-from torchgrasp.ik.query import query_mixture
+from torchgrasp.ik.seeds import PostureLibrary, nearest_postures, query_mixture
 from torchgrasp.shape.surface import extract_surface
 
 SPEC = ContactSpec(table=0.0)

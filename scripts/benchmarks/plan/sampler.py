@@ -20,7 +20,7 @@ from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.joint import solve_joint
-from torchgrasp.ik.posture_library import PostureLibrary, nearest_postures
+from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.starts import STARTS_PER_CHUNK, drawn_starts, settle_flatness

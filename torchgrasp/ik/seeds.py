@@ -1,45 +1,38 @@
-"""Random postures of a hand, the nearest of which become seeds.
+"""Seeds of the hand near contacts: the nearest of random postures, or configurations of the learned model.
 
-One matrix product compares the contacts of every row with thousands of postures, in all assignments or the likely ones.
-Clearances rank the nearest, so a hand from above comes before one from below.
+One matrix product compares the contacts of every row with thousands of postures. Clearances rank the nearest postures.
 """
 
 import dataclasses
-import hashlib
 import itertools
-from collections import OrderedDict
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, check_device, check_whole, join, named_tensors
-from torchgrasp.checks import Count, Seed, checked
+from torchgrasp.base import Value, check_device, check_whole, join, settle
+from torchgrasp.checks import Count, Positive, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
+from torchgrasp.ik.ranking import lexical_order
 from torchgrasp.ik.refine import TIP_WEIGHT
+from torchgrasp.posture_model.compatibility import check_compatible
+from torchgrasp.posture_model.encoding import encode
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values import Contacts, IKSeeds
 
-LIBRARY_SIZE = 5000
-"""Random postures of a library; with 2000 or 20000 the share of triples with a grasp differs by 0.02."""
-LARGE_LIBRARY = 20_000
-"""The same for more fingertips, fewer of whose contacts are near a posture: a fifth more grasps than with 5000, in a
-second."""
 LENGTH_SCALE, COSINE_SCALE = 0.01, 0.5
-"""Distances of tip centres [m] and of pad axes that count the same: tips roll, and a solver turns them."""
+"""Distances of tip centres [m] and of pad axes that count the same."""
 CANDIDATES = 64
-"""Nearest postures of a row, over all assignments, whose clearances are measured; also the most seeds of it."""
-ASSIGNMENTS, JUDGES = 6, 500
-"""Assignments of contacts to fingers in which a row is compared with the whole library: all of three fingertips. Of the
-24 or 120 of more, those to which one of so many postures is nearest."""
-KEPT = 4
-"""Libraries kept in a process, 9 MB each, 40 MB for more fingertips: two hands with two sets of fingers."""
-ASKED = 3
-"""Seeds whose poses an arm is asked for, to each that is kept: an arm refuses about half."""
+"""Nearest postures of a row, over all assignments, whose clearances are measured; also the most seeds of a row."""
+ASSIGNMENTS = 6
+"""Assignments of contacts to fingers in which a row is compared with the whole library."""
+WRONG_SIDE = 0.3
+"""Mean cosine of the outward normals of tips and contacts above which a seed touches from inside."""
 
 
 @checked
@@ -71,19 +64,15 @@ class PostureLibrary(Value):
     @classmethod
     @checked
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
-        """Draw postures within the joint limits and free of self-collision; count None: as many as work well.
+        """Draw postures within the joint limits and free of self-collision; more for more than three fingertips.
 
-        The last libraries are kept: a process draws that of a hand once.
+        The last library is kept with the hand.
         """
-        count = (LIBRARY_SIZE if len(hand.tips) == 3 else LARGE_LIBRARY) if count is None else count
-        key = f"{_digest(hand)} {hand.lower.device} {count} {seed}"
-        if key in _KEPT:
-            _KEPT.move_to_end(key)
-            return _KEPT[key]
-        _KEPT[key] = library = cls._drawn(hand, count, seed)
-        if len(_KEPT) > KEPT:
-            _KEPT.popitem(last=False)
-        return library
+        count = (5000 if len(hand.tips) == 3 else 20_000) if count is None else count
+        found = hand.derived.get(PostureLibrary)
+        if found is None or found[0] != (count, seed):
+            found = hand.derived[PostureLibrary] = (count, seed), cls._drawn(hand, count, seed)
+        return found[1]
 
     @classmethod
     def _drawn(cls, hand: Hand, count: int, seed: int) -> "PostureLibrary":
@@ -96,17 +85,8 @@ class PostureLibrary(Value):
         return cls(hand, joints, vf_from_hand, centres, feature(centres, pads), hand.sphere_centres(joints).float())
 
 
-_KEPT: "OrderedDict[str, PostureLibrary]" = OrderedDict()
-
-
-def _digest(hand: Hand) -> str:
-    """Return a hash of every number of a hand, whatever file it is from."""
-    numbers = (t.detach().cpu().contiguous().numpy().tobytes() for t in named_tensors(hand).values())
-    return hashlib.sha256(b"|".join([hand.name.encode(), *numbers])).hexdigest()
-
-
 def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the triangle that stands for points in the order of the fingers: first, centre of those between, last."""
+    """Return the first point, the centre of the points between, and the last point, in the order of the fingers."""
     if points.shape[-2] == 3:
         return points
     between = points[..., 1:-1, :].mean(-2, keepdim=True)
@@ -114,7 +94,7 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the `virtual_frame` of three to five points: that of their triangle, about the centre of all.
+    """Return the frame of three to five points: the `virtual_frame` of their triangle, about the centre of all points.
 
     Raises:
         DegenerateContacts: a triangle is too flat.
@@ -137,9 +117,9 @@ def nearest_postures(
 ) -> IKSeeds:
     """Return the postures nearest to contacts, placed by Eq. (24) with the tips' centres for fingertips.
 
-    Seeds come in the order of the contacts' rows, best first within a row. A row without a `tips_frame` has none.
-    `energy` is half the squared distance of the features. Poses that `reachable` refuses make room for the next best
-    ones.
+    Seeds are in the order of the contacts' rows, best first within a row. A row without a `tips_frame` has no seeds.
+    `energy` is half the squared distance of the features. If `reachable` refuses a pose, the next posture takes its
+    place.
 
     Raises:
         BadArgument: `n_seeds`, for each row, is not in [1, 64], or above six times the number of postures; contacts on
@@ -177,9 +157,9 @@ def nearest_postures(
         cost = tips + collision_cost(spheres, library.hand.collision_spheres, world)
         if reachable is None:
             best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
-            b = at.repeat_interleave(n_seeds)  # from here on one row a seed
+            b = at.repeat_interleave(n_seeds)  # one row for each seed
         else:
-            best = cost.topk(min(ASKED * n_seeds, candidates), 1, largest=False).indices
+            best = cost.topk(min(3 * n_seeds, candidates), 1, largest=False).indices
             reached = ask_reachable(reachable, obj_from_hand[at, best].flatten(0, 1)).reshape(best.shape)
             kept = reached & (reached.cumsum(1) <= n_seeds)
             b, best = at.expand_as(best)[kept], best[kept]
@@ -195,7 +175,7 @@ def nearest_postures(
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
 ) -> tuple[Float[Tensor, "r p 4 4"], Float[Tensor, "r p d"]]:
-    """Return frames and features of contacts in every assignment, any where an assignment is not `framed`."""
+    """Return frames and features of contacts in every assignment; they are arbitrary if it is not `framed`."""
     stand_in = torch.eye(3, dtype=centres.dtype, device=centres.device)
     triangle = torch.where(framed[..., None, None], triangle_of(centres), stand_in)
     obj_from_vf = rigid(virtual_frame(triangle)[..., :3, :3], centres.mean(-2))
@@ -214,8 +194,69 @@ def _energies(
 def _likely_assignments(
     wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
 ) -> Int[Tensor, "r a"]:
-    """Return the `ASSIGNMENTS` of each row to which one of the first `JUDGES` postures is nearest."""
+    """Return the assignments of each row that are nearest to one of the first 500 postures."""
     if wanted.shape[1] <= ASSIGNMENTS:
         return torch.arange(wanted.shape[1], device=wanted.device).expand(len(wanted), -1)
-    nearest = _energies(wanted, given[:JUDGES], framed).amin(-1)
+    nearest = _energies(wanted, given[:500], framed).amin(-1)
     return nearest.topk(ASSIGNMENTS, 1, largest=False).indices
+
+
+@checked
+def query_mixture(
+    hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: Count = 8, max_energy: Positive = DEFAULT_ENERGY
+) -> IKSeeds:
+    """Return the learned model's configurations near the contacts, in all six assignments (Eqs. 21-24).
+
+    For every assignment within reach (Eq. 21) the joints are the conditional mean (Eq. 23) and the means of the most
+    responsible components, clamped to the limits. Eq. (24) places the hand. Fingertips are still off by centimetres.
+    Seeds are in the order of the contacts' rows. Within a row, seeds on the right side of the surface come first, then
+    seeds of smaller tip error. An unreachable row has no seeds.
+
+    Args:
+        contacts: triples on the object; hand and mixture are moved to their device.
+        mixture: the hand's learned model.
+        n_seeds: for each assignment, at most one more than the mixture has components.
+        max_energy: threshold on the least f_i of Eq. (21); `PAPER_ENERGY` is the paper's.
+
+    Raises:
+        BadArgument: a mixture of another hand, limits or fingertips, a number out of range, or malformed contacts.
+
+    >>> from torchgrasp.hand.load import load_hand
+    >>> from torchgrasp.posture_model.mixture import load_mixture
+    >>> points = 0.05 * torch.eye(3)[None]
+    >>> seeds = query_mixture(load_hand("allegro"), Contacts(points, 20 * points), load_mixture("allegro"))
+    """
+    check_compatible(mixture.meta, mixture.joint_names, hand)
+    check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
+    if not max_energy > 0:
+        raise BadArgument("max_energy", max_energy, "a positive number")
+    hand, mixture = settle(hand, contacts.points.device), settle(mixture, contacts.points.device)
+    firsts = range(0, max(len(contacts), 1), 256)  # their configurations stay in the cache
+    parts = [_query(hand, contacts[k : k + 256], mixture, n_seeds, max_energy) for k in firsts]
+    rows = torch.cat([part.row + k for part, k in zip(parts, firsts, strict=True)])
+    return dataclasses.replace(join(parts), row=rows)
+
+
+def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, max_energy: float) -> IKSeeds:
+    """Return the seeds of some triples."""
+    code = encode((contacts.points.double(), contacts.normals.double()))
+    energy = mixture.energy(code)
+    row, assignment = torch.nonzero(energy < max_energy, as_tuple=True)  # NaN is not less
+    q = code.q[row, assignment]
+    joints = mixture.joints(q)[:, None]
+    if n_seeds > 1:
+        joints = torch.cat([joints, mixture.modes(q, n_seeds - 1)[0]], dim=1)
+    joints = joints.clamp(hand.lower.to(joints), hand.upper.to(joints)).flatten(0, 1)
+    row, assignment = row.repeat_interleave(n_seeds), assignment.repeat_interleave(n_seeds)
+    tips, tip_normals = hand.fingertips(joints)
+    framed = ~degenerate(tips)
+    joints, row, assignment, tips, tip_normals = (x[framed] for x in (joints, row, assignment, tips, tip_normals))
+    permutation = code.permutation[assignment]
+    obj_from_hand = code.obj_from_vf[row, assignment] @ inverse(virtual_frame(tips))  # Eq. (24)
+    points = contacts.points.double()[row[:, None], permutation]
+    normals = contacts.normals.double()[row[:, None], permutation]
+    tip_error = torch.linalg.vector_norm(apply(obj_from_hand, tips) - points, dim=-1)
+    wrong_side = (rotate(obj_from_hand, tip_normals) * normals).sum(-1).mean(-1) > WRONG_SIDE
+    order = lexical_order(row, wrong_side.int(), tip_error.amax(-1))
+    seeds = IKSeeds(joints, obj_from_hand, row, permutation, energy[row, assignment], tip_error)
+    return seeds[order].to(contacts.points.dtype)
