@@ -115,7 +115,7 @@ def close(name: str, hand: str, how: str) -> str:
     """Return the hash of a closing, a lift of 20 mm and what the simulator measured."""
     from torchgrasp import SensorModel, TrialSpec, close_hand, fit_shape, load_hand, load_object
     from torchgrasp.data.shipped import load_shipped_grasp
-    from torchgrasp.ik import surface_field
+    from torchgrasp.shape.surface import surface_field
 
     options = dict(CLOSINGS[how])
     error = torch.eye(4, dtype=torch.float64)

@@ -4,8 +4,6 @@ import dataclasses
 import math
 import time
 
-from torchgrasp.ik.rounds import assign
-
 from benchmarks.anytime.course import Course
 from benchmarks.anytime.single_start import SingleStart
 from benchmarks.common import Row

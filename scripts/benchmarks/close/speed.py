@@ -16,8 +16,8 @@ from torchgrasp.control import GraspController, Observation
 from torchgrasp.data.shipped import GraspObject
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import GraspTrial, TrialDriver
-from torchgrasp.ik import surface_field
 from torchgrasp.jobs import run_tasks
+from torchgrasp.shape.surface import surface_field
 
 SIMULATED = 5.0
 """Length of a trial [s]."""
