@@ -5,10 +5,10 @@ The names below are the core of the library, in the order of the data flow. Each
 
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.specs import ContactSpec, SensorModel, TrialSpec
+from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Certificate, ContactCode, ContactPlan, Contacts, Grasps, PointCloud, ShapeEstimate
 from torchgrasp.values import load_grasps
-from torchgrasp.closure import ClosureResult
+from torchgrasp.closure import ClosureResult, SensorModel
 from torchgrasp.cloud import cloud_from_depth, merge_clouds, read_cloud
 from torchgrasp.scene import Scene, read_scene, save_scene
 from torchgrasp.data.shipped import list_objects, load_object, load_scene

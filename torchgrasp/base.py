@@ -1,4 +1,4 @@
-"""What every value is made of: frozen dataclasses of tensors, batches with rows, checks and counts."""
+"""The base of all values: frozen dataclasses of tensors, and batches with rows."""
 
 import dataclasses
 import functools
@@ -15,8 +15,7 @@ from torchgrasp.checks import check_moved, show
 from torchgrasp.errors import BadArgument, FailedRows, Status
 
 FINGERTIPS = (3, 5)
-"""Fewest and most fingertips on an object: two points do not hold it against turning about their line, and hands have
-at most five fingers."""
+"""Fewest and most fingertips on an object: two contacts do not resist a rotation about their line."""
 
 SomeValue = TypeVar("SomeValue", bound="Value")
 SomeBatch = TypeVar("SomeBatch", bound="Batch")
@@ -43,7 +42,7 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
     fields = {name: merge(name, *(getattr(value, name) for value in values)) for name in _names(kind)}
     if hasattr(kind, "__post_init__"):
         return kind(**fields)
-    new = object.__new__(kind)  # what comes of checked fields is not checked again: loops make thousands of values
+    new = object.__new__(kind)  # checked fields need no second check, and loops make thousands of values
     new.__dict__.update(fields)
     return new
 
@@ -54,15 +53,11 @@ def _names(kind: type) -> tuple[str, ...]:
     return tuple(f.name for f in dataclasses.fields(kind))
 
 
-SHOWN, WIDTH = 4, 110
-"""Most numbers of a tensor that a value's text shows; letters in its lines. So no value fills a notebook's page."""
-
-
 class Value:
     """Base of all values: `.to()` maps every tensor inside, nested values included, into a new value."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Give each value the short text: a dataclass would write every number."""
+        """Give each class the short text of `Value` instead of every number."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):
             cls.__repr__ = Value.__repr__
@@ -71,14 +66,14 @@ class Value:
         """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small ones."""
         fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
         parts = [f"{f.name}={_short(getattr(self, f.name))}" for f in fields]
-        lines = textwrap.wrap(f"{type(self).__name__}({', '.join(parts)})", WIDTH, subsequent_indent="    ")
+        lines = textwrap.wrap(f"{type(self).__name__}({', '.join(parts)})", 110, subsequent_indent="    ")
         return "\n".join(lines if len(lines) <= 12 else [*lines[:11], "    ...)"])
 
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
         """Return the value on another device or in another floating dtype; integers keep theirs.
 
         Raises:
-            BadArgument: no device that is there, or another dtype than float32 and float64.
+            BadArgument: the device does not exist, or the dtype is neither float32 nor float64.
         """
         check_moved(*args, **kwargs)
 
@@ -90,19 +85,19 @@ class Value:
 
 
 def _short(value: Any) -> str:
-    """Return a field of a value in few letters."""
+    """Return a field of a value as a short text."""
     if isinstance(value, Tensor):
-        if value.numel() <= SHOWN and value.device.type == "cpu":
+        if value.numel() <= 4 and value.device.type == "cpu":
             return _digits(value.tolist())
         return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
-    if isinstance(value, dict | list | tuple) and len(value) > SHOWN:
+    if isinstance(value, dict | list | tuple) and len(value) > 4:
         return f"{type(value).__name__} of {len(value)}"
     text = " ".join(repr(value).split()) if isinstance(value, Value) else repr(value)  # wrapped once, as a whole
-    return text if len(text) <= WIDTH or isinstance(value, Value) else f"{text[: WIDTH - 3]}..."
+    return text if len(text) <= 110 or isinstance(value, Value) else f"{text[:107]}..."
 
 
 def _digits(value: Any) -> str:
-    """Return numbers, in lists or not, with five digits."""
+    """Return a number, or nested lists of numbers, with five digits."""
     if isinstance(value, list):
         return f"[{', '.join(map(_digits, value))}]"
     return f"{value:.5g}" if isinstance(value, float) else str(value)
@@ -119,7 +114,7 @@ class Batch(Value):
         """Select rows by a slice, a mask or indices. A single index of any kind keeps the batch axis.
 
         Raises:
-            BadArgument: a single boolean, or what is no index.
+            BadArgument: a single boolean, or no index at all.
             IndexError: a single index beyond the rows.
         """
         chosen = read_rows(rows, len(self))  # once for all tensors: on a GPU the host waits for the number of rows
@@ -139,7 +134,7 @@ class Batch(Value):
 
 
 def read_rows(rows: Any, count: int) -> slice | Tensor:
-    """Return a slice, or a tensor of indices, for what selects some of so many rows; raises as `Batch.__getitem__`."""
+    """Return an index of any kind into `count` rows as a slice or a tensor; raises as `Batch.__getitem__`."""
     refused = BadArgument("rows", show(rows), "an index, a slice, a mask of all rows or a tensor of indices")
     if isinstance(rows, slice):
         return rows
@@ -164,17 +159,17 @@ def read_rows(rows: Any, count: int) -> slice | Tensor:
 
 
 def join(parts: Sequence[SomeBatch]) -> SomeBatch:
-    """Put the rows of batches of one kind one below the other; fields without rows are those of the first."""
+    """Concatenate the rows of batches; fields without tensors are those of the first batch."""
     return map_tensors(lambda *tensors: torch.cat(tensors), *parts)
 
 
 def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch:
-    """Return the new rows where `choose`, the old ones elsewhere."""
+    """Return the new rows where `choose` is True, and the old rows elsewhere."""
     return map_tensors(lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
 
 def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
-    """Return a batch with `part` in the rows `at`."""
+    """Return a batch whose rows `at` are those of `part`."""
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
@@ -204,7 +199,7 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
 
 
 def settle(value: SomeValue, device: torch.device) -> SomeValue:
-    """Return a value on a device: itself, with all that it has cached, where it is there already."""
+    """Return a value on a device; a value that is there already is returned itself, with its caches."""
     return value if all(x.device == device for x in named_tensors(value).values()) else value.to(device)
 
 

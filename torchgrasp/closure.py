@@ -1,14 +1,14 @@
-"""The values of closing a hand: gains before, and what happened after. The other values are in `torchgrasp.values`."""
+"""The values of closing a hand: options and gains before, and the measured result after."""
 
 import dataclasses
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.checks import ANY, Measured, checked
-from torchgrasp.errors import Status
+from torchgrasp.checks import ANY, Measured, Range, checked
+from torchgrasp.errors import BadArgument, Status
 
 
 @checked
@@ -48,12 +48,16 @@ class ObjectMotion(NamedTuple):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Disturbance(Value):
-    """What a trial did to all but its object.
+    """Unplanned contacts of the hand in a trial.
 
-    The three columns are neighbours, table, and the object by links other than the fingers'. `first_touch` [s] is when
-    the hand first touched each, infinite if never. `impulse` [N s] is the sum of its normal impulses, `force` [N] the
-    largest mean normal force of a control tick. `early` tells whether that was before a fingertip touched the object.
-    `neighbour_pose` is the motion of each of m neighbours from its start.
+    The three columns are contacts with neighbours, with the table, and of other links than the fingers with the object.
+
+    Args:
+        first_touch: time [s] of the first contact; infinite without one.
+        impulse: sum of the normal impulses [N s].
+        force: largest mean normal force [N] in a control tick.
+        early: whether the first contact was before a fingertip touched the object.
+        neighbour_pose: motion of each of m neighbours from its start.
     """
 
     first_touch: Annotated[Float[Tensor, "3"], ANY]
@@ -66,11 +70,16 @@ class Disturbance(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingTrace(Value):
-    """What the fingertips truly did at every tick, and what the controller made of it; all in the hand's frame.
+    """True contacts at every control tick, and estimates of the controller, in the hand's frame.
 
-    `forces` [N] act on the object, friction included, at `points` [m] with outward `normals`, NaN without contact.
-    `sliding` [m/s] is the speed of each tip along the surface, `blend` lambda of Eq. (26), NaN without the law.
-    `friction` is what the hand believes, `load` [N] what it feels, NaN before the holding "grip".
+    Args:
+        forces: forces [N] on the object, with friction.
+        points: contact points [m]; NaN without contact.
+        normals: outward unit normals; NaN without contact.
+        sliding: speed [m/s] of each fingertip along the surface.
+        blend: lambda of Eq. (26); NaN if the control law was not active.
+        friction: friction estimated by the holding "grip"; NaN before.
+        load: load [N] estimated by the holding "grip"; NaN before.
     """
 
     forces: Annotated[Float[Tensor, "t f 3"], ANY]
@@ -85,19 +94,30 @@ class ClosingTrace(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureResult(Value):
-    """What happened when the hand closed on the true object.
+    """The result of closing a hand on the true object. A number is NaN if the trial ended before it was measured.
 
-    `time` [s] counts control ticks. `forces` [N] is the normal force of each fingertip. `object_pose` and `hand_pose`
-    are the frames of object and hand in the world. `joints` has every joint of the URDF, in the order of `joint_names`.
-    `contact_order` lists the fingers by their first touch. `object_motion` is the motion of the object in the hand
-    from the pre-grasp to the end; `slip` is its part since the hand pressed. Two motions are in the world: `pushed` is
-    from the pre-grasp until all fingers have touched, or the closing ended, `before_lift` from the start until the hand
-    rises. `unbalanced` is then the sum of the fingertips' forces over the sum of their sizes. What a trial did not
-    reach is NaN. `start_overlap` [m] is the depth of the
-    opened hand in object or table at the start. `held` tells whether the object is up with the hand at the end and
-    slipped little; `seconds` is wall time. Poses are in the frame of the grasp. `phases` [s] are the times at which the
-    hand had arrived, all fingers had touched, and the hand had pressed; NaN if it never did. `stops` counts how often
-    the hand stopped on its way because it touched something, `attempts` how often it closed.
+    Args:
+        held: whether the object was lifted with the hand and slipped little.
+        status: the reason if it was not held.
+        time: times [s] of the control ticks.
+        forces: normal force [N] of each fingertip.
+        object_pose: pose of the object in the frame of the grasp.
+        hand_pose: pose of the hand in the frame of the grasp.
+        joints: every joint of the URDF, in the order of `joint_names`.
+        joint_names: names of the joints.
+        contact_order: the fingers in the order of their first contacts.
+        object_motion: motion of the object in the hand from the pre-grasp to the end.
+        pushed: motion of the object from the pre-grasp until all fingers touched, or the closing ended.
+        before_lift: motion of the object from the start to the lift.
+        unbalanced: norm of the sum of the fingertips' forces before the lift, over the sum of their norms.
+        slip: motion of the object in the hand since the hand pressed.
+        start_overlap: depth [m] of the opened hand in object or table at the start.
+        disturbance: unplanned contacts.
+        trace: contacts and estimates at every tick.
+        phases: times [s] at which the hand arrived, all fingers touched, and the hand pressed; NaN if never.
+        stops: how often the approaching hand stopped at a contact.
+        attempts: how often the hand closed.
+        seconds: wall time [s] of the trial.
     """
 
     held: bool
@@ -121,3 +141,85 @@ class ClosureResult(Value):
     stops: int
     attempts: int
     seconds: float
+
+
+SensorKind = Literal["tactile", "torque", "binary"]
+"""Kinds of fingertip sensors, see `SensorModel`."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class ClosingOptions(Value):
+    """Components that the closings "uncertainty" and "fixed" add to the paper's control law.
+
+    Args:
+        wait: a finger that touches waits for the others; then all press together.
+        pose_estimate: touches that come early or late estimate the object's pose, and all contacts move with it.
+        palm_reach: largest displacement [m] of the palm that follows the estimated object; 0: the arm does not yield.
+        stops: how often the approaching hand stops where it touches something, to go around it; 0: never.
+        attempts: how often the hand closes. On a known table it closes again if the grasp seems too weak to lift.
+
+    Raises:
+        BadArgument: a number outside its range; a palm that moves or a second attempt without `pose_estimate`; stops
+            of a palm that does not move.
+
+    >>> ClosingOptions(palm_reach=0.0, stops=0).attempts  # an arm that cannot yield
+    2
+    """
+
+    wait: bool = True
+    pose_estimate: bool = True
+    palm_reach: Annotated[float, Range(0.0, 0.1)] = 0.02
+    stops: Annotated[int, Range(0, 100)] = 3
+    attempts: Annotated[int, Range(1, 100)] = 2
+
+    def __post_init__(self) -> None:
+        """Check which components need each other."""
+        if not self.pose_estimate and (self.palm_reach or self.attempts > 1):
+            found = f"a reach of {self.palm_reach:g} m and {self.attempts} attempts without pose_estimate"
+            raise BadArgument("palm_reach", found, "0 m and 1 attempt")
+        if self.stops and not self.palm_reach:
+            raise BadArgument("stops", f"{self.stops} with a reach of 0 m", "0")
+
+
+NO_OPTIONS = ClosingOptions(wait=False, pose_estimate=False, palm_reach=0.0, stops=0, attempts=1)
+"""No component: the paper's own control law."""
+
+
+def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptions:
+    """Return the components of a closing: given ones, or all that it has; raise `BadArgument` if it has none."""
+    if closing in ("uncertainty", "fixed"):
+        return ClosingOptions() if options is None else options
+    if options is not None:
+        raise BadArgument("options", f"components for {closing!r}", "None, or closing 'uncertainty' or 'fixed'")
+    return NO_OPTIONS
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class SensorModel(Value):
+    """The sensors of a hand's fingertips; `FingertipSensor` simulates them.
+
+    Args:
+        kind: "tactile": force, place and sliding of each contact, as of a BioTac. "torque": the force alone, from
+            the torques of the finger's joints. "binary": whether the fingertip touches.
+        delay: age [s] of the readings, in whole samples of the sensor.
+        noise: factor on the usual noise.
+        dead: names of the fingers whose sensor is known to be broken.
+
+    Raises:
+        BadArgument: a number outside its range, an unknown kind.
+
+    >>> SensorModel("binary").full
+    False
+    """
+
+    kind: SensorKind = "tactile"
+    delay: Annotated[float, Range(0.0, 0.2)] = 0.0
+    noise: Annotated[float, Range(0.0, 100.0)] = 1.0
+    dead: tuple[str, ...] = ()
+
+    @property
+    def full(self) -> bool:
+        """Whether all fingers sense force, place and sliding."""
+        return self.kind == "tactile" and not self.dead

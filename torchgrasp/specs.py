@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from torchgrasp.base import FINGERTIPS, Value
 from torchgrasp.checks import Range, checked
+from torchgrasp.closure import ClosingOptions, SensorModel, choose_options
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, as_plane
 
@@ -12,12 +13,9 @@ Simulator = Literal["sapien", "mujoco"]
 """The simulators."""
 
 TIP_RADIUS, SEPARATION = 0.012, 0.026
-"""Radius [m] of the Allegro's fingertips, and the least distance [m] of their centres: their width and 2 mm.
-Smaller tips get as much room: the link behind a tip is wider than its sphere."""
-
+"""Default radius [m] of a fingertip, and least distance [m] between two: smaller tips have wider links behind them."""
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
-"""Radii [m] within which contacts are flat, the widest that the object offers. With 4 mm instead of 8 one triple in 100
-fewer is closed on the true surface, but balls of 40 mm and things 25 mm high have contacts at all."""
+"""Radii [m] within which the surface at a contact is flat; the largest that the object allows is used."""
 
 
 @checked
@@ -25,8 +23,8 @@ fewer is closed on the true surface, but balls of 40 mm and things 25 mm high ha
 class ContactSpec(Value):
     """What three to five contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
 
-    The estimated surface differs from the true one, so contacts keep margins beyond the paper: less friction, flat
-    surface, a distance of a fingertip. `docs/planning.md` has their measured worth.
+    The estimated surface differs from the true one, so contacts keep margins beyond the paper's: a lower friction, a
+    flat surface, and the distance of a fingertip.
 
     Args:
         friction: coefficient of friction between fingertip and object at execution.
@@ -34,10 +32,9 @@ class ContactSpec(Value):
         max_variance: S_thresh of Eq. (12), a variance in normalised units.
         friction_margin: contacts are planned and certified with `friction * friction_margin`.
         separation: least distance between the centres of two fingertips on their contacts [m]; None: their width and
-            2 mm. Contacts on opposite sides of a thin thing may be as near as it is thin.
-        flatness: largest angle [rad] between the normals of the surface at a contact and on a ring around it; None: not
-            checked.
-        flat_radius: radius [m] of that ring; None: `FLAT_RADII`, the widest that the object offers.
+            2 mm. Contacts on opposite sides of a thin object may be closer.
+        flatness: largest angle [rad] between the normals at a contact and on a ring around it; None: not checked.
+        flat_radius: radius [m] of the ring; None: the largest of `FLAT_RADII` that the object allows.
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None: no table.
         tip_radius: radius [m] of the fingertips, which may rest on the table; 0: points. None: the hand's.
         start_radius: normalised radius of the sphere from which starts are drawn (Sec. 6.2; the paper: 0.1).
@@ -76,12 +73,12 @@ class ContactSpec(Value):
 
     @property
     def fingertip_radius(self) -> float:
-        """The radius [m] of fingertips that contacts make room for."""
+        """The radius [m] of the fingertips."""
         return TIP_RADIUS if self.tip_radius is None else self.tip_radius
 
     @property
     def ring_radius(self) -> float:
-        """The radius [m] within which contacts are flat."""
+        """The radius [m] within which the surface at a contact is flat."""
         return FLAT_RADII[0] if self.flat_radius is None else self.flat_radius
 
     @property
@@ -92,12 +89,12 @@ class ContactSpec(Value):
 
     @property
     def least_height(self) -> float:
-        """The height [m] that an upright wall needs between fingertips on the table: their radius and a flat ring."""
+        """The least height [m] of an upright wall that a fingertip above the table can touch."""
         return self.fingertip_radius + (FLAT_RADII[-1] if self.flat_radius is None else self.flat_radius)
 
     @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
-        """Return the spec with the fingertip radius [m] of a hand, at least `TIP_RADIUS`; a given radius stays.
+        """Return the spec with a hand's fingertip radius [m], at least `TIP_RADIUS`, unless the spec has a radius.
 
         >>> wide, points = ContactSpec().for_fingertips(0.015), ContactSpec(tip_radius=0.0).for_fingertips(0.015)
         >>> wide.tip_radius, points.tip_radius
@@ -110,7 +107,7 @@ class ContactSpec(Value):
     def paper(
         cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03, table: Plane | float | None = None
     ) -> "ContactSpec":
-        """Return the paper's own problem: full friction, no separation or flatness; contacts lie above the table.
+        """Return the paper's own problem: full friction, no separation, no flatness; contacts lie above the table.
 
         >>> ContactSpec.paper(friction=0.8).planned_friction, ContactSpec.paper().flatness
         (0.8, None)
@@ -122,100 +119,19 @@ class ContactSpec(Value):
 Mode = Literal["joint", "contact_first", "paper"]
 """How planned contacts become grasps.
 
-* "joint": seeds are random postures near each triple; where none succeeds, the contacts slide with the hand.
-* "contact_first": the learned model's seeds move onto fixed contacts.
-* "paper": the paper's chain as written (docs/paper.md): the model's seeds by Eqs. 21-24, moved by COBYLA. Shape,
-  contacts and ranking are the paper's too, unless given.
+* "joint": seeds are random postures near each set of contacts. If none succeeds, the contacts slide with the hand.
+* "contact_first": seeds of the learned model are refined onto fixed contacts.
+* "paper": the paper's chain (docs/paper.md): seeds of the model by Eqs. 21-24, refined by COBYLA, and the paper's
+  shape, contacts and ranking.
 """
 Ranking = Literal["success", "variance"]
-"""Which executable grasp comes first: the likeliest success, or the least sum of variances as in the paper."""
+"""The best grasp: that of the highest predicted success, or of the least sum of variances as in the paper."""
 
 ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper", "uncertainty"]
 """How a hand closes, see `TrialSpec`."""
 
 HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
 """How a closed hand presses, see `TrialSpec`."""
-
-SensorKind = Literal["tactile", "torque", "binary"]
-"""Kinds of fingertip sensors, see `SensorModel`."""
-
-
-@checked
-@dataclasses.dataclass(frozen=True)
-class ClosingOptions(Value):
-    """Components that the closings "uncertainty" and "fixed" add to the paper's control law.
-
-    Args:
-        wait: a finger that touches waits for the others; then all press together.
-        pose_estimate: touches that come early or late estimate the object's pose, and all contacts move with it.
-        palm_reach: largest displacement [m] of the palm that follows the estimated object; 0: the arm does not yield.
-        stops: how often the approaching hand stops where it touches something, to go around it; 0: never.
-        attempts: how often the hand closes. On a known table it closes again if the grasp seems too weak to lift.
-
-    Raises:
-        BadArgument: a number outside its range; a palm that moves or a second attempt without `pose_estimate`; stops
-            of a palm that does not move.
-
-    >>> ClosingOptions(palm_reach=0.0, stops=0).attempts  # an arm that cannot yield
-    2
-    """
-
-    wait: bool = True
-    pose_estimate: bool = True
-    palm_reach: Annotated[float, Range(0.0, 0.1)] = 0.02
-    stops: Annotated[int, Range(0, 100)] = 3
-    attempts: Annotated[int, Range(1, 100)] = 2
-
-    def __post_init__(self) -> None:
-        """Check which components need each other."""
-        if not self.pose_estimate and (self.palm_reach or self.attempts > 1):
-            found = f"a reach of {self.palm_reach:g} m and {self.attempts} attempts without pose_estimate"
-            raise BadArgument("palm_reach", found, "0 m and 1 attempt")
-        if self.stops and not self.palm_reach:
-            raise BadArgument("stops", f"{self.stops} with a reach of 0 m", "0")
-
-
-NO_OPTIONS = ClosingOptions(wait=False, pose_estimate=False, palm_reach=0.0, stops=0, attempts=1)
-"""No component: the paper's own control law."""
-
-
-def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptions:
-    """Return the components of a closing: given ones, or all that it has; raise `BadArgument` if it has none."""
-    if closing in ("uncertainty", "fixed"):
-        return ClosingOptions() if options is None else options
-    if options is not None:
-        raise BadArgument("options", f"components for {closing!r}", "None, or closing 'uncertainty' or 'fixed'")
-    return NO_OPTIONS
-
-
-@checked
-@dataclasses.dataclass(frozen=True)
-class SensorModel(Value):
-    """The sensors of a hand's fingertips; `FingertipSensor` simulates them.
-
-    Args:
-        kind: "tactile": force, place and sliding of each contact, as of a BioTac. "torque": the force alone, from
-            the torques of the finger's joints. "binary": whether the fingertip touches.
-        delay: age [s] of the readings, in whole samples of the sensor.
-        noise: factor on the usual noise.
-        dead: names of the fingers whose sensor is known to be broken.
-
-    Raises:
-        BadArgument: a number outside its range, an unknown kind.
-
-    >>> SensorModel("binary").full
-    False
-    """
-
-    kind: SensorKind = "tactile"
-    delay: Annotated[float, Range(0.0, 0.2)] = 0.0
-    noise: Annotated[float, Range(0.0, 100.0)] = 1.0
-    dead: tuple[str, ...] = ()
-
-    @property
-    def full(self) -> bool:
-        """Whether all fingers sense force, place and sliding."""
-        return self.kind == "tactile" and not self.dead
 
 
 @checked

@@ -9,12 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.observation import Observation, Targets
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.geometry.frames import rotation_angle
-from torchgrasp.specs import ClosingOptions, TrialSpec
+from torchgrasp.specs import TrialSpec
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Joint targets from an observation and the period [s]."""

@@ -8,13 +8,13 @@ import torch
 from scipy.optimize import minimize
 
 from tests.point_fingers import NORMALS, PERIOD, TARGET, observation, real, reference
+from torchgrasp.closure import ClosingOptions
 from torchgrasp.control import GraspController, TipContact, measure, no_contact
 from torchgrasp.control.law import surface_covariance
 from torchgrasp.control.object_pose import ContactPlanes
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.specs import ClosingOptions
 
 AROUND = unit(real([[1, 0.3, 0.1], [-0.4, 1, 0], [-0.5, -0.9, 0.2]]))
 """Normals that span the plane across z, and a little more."""

@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.controller import CLOSING_TIME, GraspController
 from torchgrasp.control.forces import desired_forces
 from torchgrasp.control.holding import RAMP, ForceHold, held_forces
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.control.recovery import PRESSING_TIME
 from torchgrasp.errors import BadArgument
-from torchgrasp.specs import ClosingOptions, TrialSpec
+from torchgrasp.specs import TrialSpec
 
 PRESSED = (2.0, 2.0, 4.0)
 

@@ -7,6 +7,7 @@ import torch
 
 from tests.control.test_localization import CENTER, RADIUS, ball, field
 from tests.point_fingers import PERIOD, observation, real, reference
+from torchgrasp.closure import ClosingOptions, SensorModel
 from torchgrasp.control import ClosingReference, GraspController
 from torchgrasp.control.object_pose import FINE_TURNS, TURNS
 from torchgrasp.control.recovery import ACCELERATION, CAREFUL_SPEED, SPEED, GuardedApproach
@@ -15,7 +16,6 @@ from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
-from torchgrasp.specs import ClosingOptions, SensorModel
 
 ALL = ClosingOptions()
 DOWN, LENGTH, TIP = real([0.0, -1.0, 0.0]), 0.08, 0.01

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, TARGET, observation, real, reference
+from torchgrasp.closure import SensorModel
 from torchgrasp.control.object_pose import FINE_TURNS, PITCH, TURNS, Localization, Touches
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.specs import SensorModel
 
 CENTER, RADIUS = TARGET.mean(0), 0.03
 HALF = real([0.03, 0.02, 0.045])

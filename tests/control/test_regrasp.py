@@ -7,12 +7,12 @@ import torch
 
 from tests.control.test_uncertainty_closing import press
 from tests.point_fingers import NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
 from torchgrasp.control import GraspController
 from torchgrasp.control.controller import CLOSING_TIME
 from torchgrasp.control.recovery import MISPLACED, OPENING_TIME, PRESSING_TIME, GraspCheck, Reopening
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.specs import NO_OPTIONS, ClosingOptions, SensorModel
 
 STILL, PLACE = torch.zeros(3).double(), torch.zeros(6).double()
 

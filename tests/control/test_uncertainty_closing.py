@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.point_fingers import FREE, GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from torchgrasp.closure import NO_OPTIONS, ClosingOptions
 from torchgrasp.control import ClosingReference, GraspController, TipContact, measure, no_contact
 from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, position_gain, surface_covariance
 from torchgrasp.control.observation import Observation
@@ -14,7 +15,6 @@ from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing,
 from torchgrasp.control.sensing import WAITING_FORCE
 from torchgrasp.control.uncertainty_closing import LEAD, PATIENCE, QUICK_TOUCH, UncertaintyClosing, with_equal_gains
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.specs import NO_OPTIONS, ClosingOptions
 
 ONE, TWO = torch.tensor([True, False, False]), torch.tensor([True, True, False])
 RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0)

@@ -9,6 +9,7 @@ import torch
 import trimesh
 
 from tests.pinch import HEIGHT, QUICK, close, cylinder, digest, digest_elsewhere, pinch
+from torchgrasp.closure import ClosingOptions
 from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.evaluation import GraspTrial, TrialDriver, close_hand, most_certain_first
@@ -17,7 +18,7 @@ from torchgrasp.evaluation.lift import LIFT_TIME
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.load import load_hand
-from torchgrasp.specs import ClosingOptions, TrialSpec
+from torchgrasp.specs import TrialSpec
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 

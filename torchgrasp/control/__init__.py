@@ -7,7 +7,7 @@ from torchgrasp.control.observation import Observation, Targets, observe
 from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.sensing import FingertipSensor, feel_flags, feel_torques
 from torchgrasp.control.tactile import TactileState, TipContact, measure, no_contact
-from torchgrasp.specs import ClosingOptions
+from torchgrasp.closure import ClosingOptions
 
 __all__ = [
     "ClosingGains",

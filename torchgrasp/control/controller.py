@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgrasp.base import check_device, settle
 from torchgrasp.checks import Range, checked
+from torchgrasp.closure import ClosingOptions, choose_options
 from torchgrasp.control.grip import GripHold
 from torchgrasp.control.holding import ForceHold, PositionHold
 from torchgrasp.control.observation import Observation, Targets
@@ -18,7 +19,7 @@ from torchgrasp.control.recovery import PRESSING_TIME, GraspCheck, GuardedApproa
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.specs import ClosingMode, ClosingOptions, HoldingMode, check_sensor, choose_options
+from torchgrasp.specs import ClosingMode, HoldingMode, check_sensor
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Maps an observation and the time to the next tick [s] to the targets of all joints [rad]."""

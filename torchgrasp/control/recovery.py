@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.object_pose import Localization, Touches
 from torchgrasp.control.observation import STILL, Observation
 from torchgrasp.control.reference import ClosingReference
@@ -16,7 +17,6 @@ from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ratio
-from torchgrasp.specs import ClosingOptions
 
 SPEED, CAREFUL_SPEED, ACCELERATION = 0.2, 0.08, 1.0
 """Largest speed [m/s] of the approach, largest speed [m/s] after a touch, and acceleration [m/s^2]."""

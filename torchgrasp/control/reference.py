@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import ANY, Pose, Positive, Range, check_tensor, checked
-from torchgrasp.closure import ClosingGains
+from torchgrasp.closure import ClosingGains, SensorModel
 from torchgrasp.control.forces import (
     check_squeeze,
     contacts_in_hand,
@@ -37,7 +37,6 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.specs import SensorModel
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:

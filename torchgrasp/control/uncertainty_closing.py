@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.law import POSITION_FLOOR, POSITION_RATE, blend, stay_above, tip_velocity
 from torchgrasp.control.object_pose import ContactPlanes
 from torchgrasp.control.observation import STILL, Observation
@@ -13,7 +14,6 @@ from torchgrasp.control.paper.closings import SETTLED, Settled, strongest_lead
 from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.sensing import WAITING_FORCE, DriveFeel
 from torchgrasp.geometry.linalg import limit_norm
-from torchgrasp.specs import ClosingOptions
 
 PATIENCE = 2.5
 """Longest time [s] from the first touch until the closing ends, even if some finger has not touched."""

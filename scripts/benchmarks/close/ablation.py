@@ -13,6 +13,7 @@ import torch
 
 from benchmarks.common import Row
 from torchgrasp import Grasps, Status, TrialSpec, close_hand, fit_shape, load_hand, plan_grasps
+from torchgrasp.closure import NO_OPTIONS, ClosingOptions
 from torchgrasp.data import list_views, read_family, read_object_mesh, read_view
 from torchgrasp.evaluation import (
     PROTOCOLS,
@@ -28,7 +29,7 @@ from torchgrasp.evaluation import (
 from torchgrasp.evaluation.intervals import RESAMPLES
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import NO_OPTIONS, ClosingOptions, ContactSpec
+from torchgrasp.specs import ContactSpec
 
 PAPER = PROTOCOLS["paper"]
 

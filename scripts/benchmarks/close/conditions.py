@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any, NamedTuple
 
-from torchgrasp.specs import NO_OPTIONS, ClosingOptions, SensorModel
+from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
 
 
 class Condition(NamedTuple):

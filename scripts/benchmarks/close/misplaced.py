@@ -25,6 +25,7 @@ from benchmarks.close.simulator_agreement import Verdicts, agreement_row
 from benchmarks.common import Row
 from benchmarks.perturb import PERTURBATIONS, household_mass, perturb_trial
 from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand, plan_grasps
+from torchgrasp.closure import SensorModel
 from torchgrasp.data import list_views, read_mass, read_object_mesh, read_view
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import (
@@ -48,7 +49,7 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec, SensorModel
+from torchgrasp.specs import ContactSpec
 from torchgrasp.values import load_grasps
 
 PLANNED_FRICTION = 0.6
