@@ -109,6 +109,15 @@ def test_a_mesh_that_ends_a_finger_gets_a_ball_on_its_surface(claw):
         assert abs(box.xyz[0]) < 1e-3 and box.size[0] < 0.0161 and box.xyz[2] < ball.xyz[2]
 
 
+def within(points, boxes):
+    """Mark the points in some of the boxes."""
+    inside = np.zeros(len(points), dtype=bool)
+    for shape in boxes:
+        pose = trimesh.transformations.compose_matrix(angles=shape.rpy, translate=shape.xyz)
+        inside |= (np.abs((points - pose[:3, 3]) @ pose[:3, :3]) <= np.array(shape.size) / 2 + 1e-5).all(1)
+    return inside
+
+
 def test_fitted_boxes_hold_all_points_and_little_else():
     """An L of two bars, 20 x 20 x 100 mm: one box would have twice its volume."""
     bars = [
@@ -117,12 +126,7 @@ def test_fitted_boxes_hold_all_points_and_little_else():
     ]
     points = np.concatenate([trimesh.sample.sample_surface(bar, 4000, seed=0)[0] for bar in bars])
     shapes = fit_shapes(points)
-    inside = np.zeros(len(points), dtype=bool)
-    for shape in shapes:
-        pose = trimesh.transformations.compose_matrix(angles=shape.rpy, translate=shape.xyz)
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        inside |= (np.abs(local) <= np.array(shape.size) / 2 + 1e-5).all(1)
-    assert inside.all() and len(shapes) <= 3
+    assert within(points, shapes).all() and len(shapes) <= 3
     assert sum(np.prod(s.size) for s in shapes) < 1.1 * (0.02 * 0.02 * 0.2)
     tube = trimesh.creation.cylinder(0.03, 0.02)
     tube.apply_transform(trimesh.transformations.rotation_matrix(0.5, (1, 0, 0)))
@@ -135,11 +139,7 @@ def test_fitted_boxes_hold_all_points_and_little_else():
 def test_flat_bodies_in_any_pose_are_covered(thickness):
     turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3))[:3, :3]
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * [0.02, 0.03, thickness] @ turn.T
-    inside = np.zeros(len(points), dtype=bool)
-    for shape in fit_shapes(points):
-        pose = trimesh.transformations.compose_matrix(angles=shape.rpy, translate=shape.xyz)
-        inside |= (np.abs((points - pose[:3, 3]) @ pose[:3, :3]) <= np.array(shape.size) / 2 + 1e-5).all(1)
-    assert inside.all()
+    assert within(points, fit_shapes(points)).all()
 
 
 def test_frames_wrist_and_masses(claw):
