@@ -111,8 +111,7 @@ class ClosingReference(Value):
             BadArgument: not exactly one row, joints or fingers of another hand, a force or stiffness that is not
                 positive, joints beyond their limits, or numbers in the grasp that are not finite.
         """
-        if len(grasp) != 1:
-            raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
+        check_single(grasp)
         check_squeeze(hand, grasp, force, kp)
         contacts = grasp.contacts
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
@@ -190,6 +189,12 @@ class ClosingReference(Value):
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
         """Return the points [m] of fingertips with given centres [m] that touch first."""
         return tips - self.hand.tips.radius[:, None] * self.normals
+
+
+def check_single(grasp: Grasps) -> None:
+    """Refuse more or fewer grasps than one."""
+    if len(grasp) != 1:
+        raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
 
 
 def next_target(

@@ -15,16 +15,15 @@ from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.control.controller import GraspController, check_holding
 from torchgrasp.control.grip import GripHold
 from torchgrasp.control.recovery import can_guard
-from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import apply_error
 from torchgrasp.geometry.frames import inverse, rigid
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import GRID, Plane, to_upright
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.sim.convex_parts import check_parts, convex_parts
+from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene import open_scene
 from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand
@@ -33,6 +32,8 @@ from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
     import trimesh
+
+    Solid = trimesh.Trimesh | Path | str
 
 APPROACH_SPEED = 0.2
 """Mean speed of the hand on its way to the pre-grasp [m/s]: slow enough to push a light object without a blow."""
@@ -82,31 +83,34 @@ class TrialDriver:
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:
         check_holding(spec.closing, spec.holding)
+        check_single(trial.grasp)
         self.trial, self.spec = trial, spec
-        hand, grasp = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
-        self.reference = reference or derive_reference(hand, grasp, spec)
-        self.obj_from_world = torch.eye(4, dtype=torch.float64)
+        hand, planned = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
+        self.obj_from_world, grasp = torch.eye(4, dtype=torch.float64), planned
         if trial.table is not None:
-            self.obj_from_world = world_frame(trial.table, grasp.obj_from_hand[0])
-            grasp = _to_world(grasp, self.obj_from_world)
-            if reference is None:
-                upright = derive_reference(hand, grasp, spec)
-                self.reference = dataclasses.replace(upright, obj_from_hand=self.reference.obj_from_hand)
+            self.obj_from_world = world_frame(trial.table, planned.obj_from_hand[0])
+            grasp = _to_world(planned, self.obj_from_world)
+        derived = derive_reference(hand, grasp, spec) if reference is None else reference
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
             raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
-        body, drives = self._body(Neighbour(read_mesh(trial.mesh), trial.parts)), hand.actuators
-        if reference is None and spec.table:
-            table = Plane.horizontal(float(body.mesh.bounds[0, 2]) if trial.table is None else 0.0)
-            known = table.moved(inverse(grasp.obj_from_hand[0]))  # the hand's true pose may be another
-            self.reference = dataclasses.replace(self.reference, table=known)
-        told = {"sensor": spec.sensor, "max_force": spec.max_force, "surface": trial.surface}
-        self.reference = self.reference if reference else dataclasses.replace(self.reference, **told)
+        body = self._body(trial.mesh, trial.parts)
+        height = float(body.mesh.bounds[0, 2]) if trial.table is None else 0.0
+        if reference is None:
+            table = Plane.horizontal(height).moved(inverse(grasp.obj_from_hand[0])) if spec.table else None
+            known = {"table": table, "surface": trial.surface, "sensor": spec.sensor, "max_force": spec.max_force}
+            derived = dataclasses.replace(derived, obj_from_hand=planned.obj_from_hand[0], **known)
+        self.reference = derived
+        self.scene_spec = self._scene_spec(hand, grasp, body)
+
+    def _scene_spec(self, hand: Hand, grasp: Grasps, body: Body) -> SceneSpec:
+        """Return the parameters of the scene; the hand's true pose may differ from its planned pose."""
+        spec, trial, drives = self.spec, self.trial, hand.actuators
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], trial.error)
         approach = true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
-        self.scene_spec = SceneSpec(
+        return SceneSpec(
             urdf_path=hand.urdf_path,
             world_from_hand=true_pose.numpy(),
             joints=_by_name(hand, grasp.pregrasp[0]),
@@ -123,15 +127,14 @@ class TrialDriver:
             table=spec.table,
             patch=spec.patch,
             height=None if trial.table is None else 0.0,
-            neighbours=tuple(self._body(neighbour) for neighbour in trial.neighbours),
+            neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in trial.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
             yields=spec.components.palm_reach,
         )
 
-    def _body(self, given: Neighbour) -> Body:
-        """Return a body in the simulator's frame, with parts and mass; parts are cut in the frame that was given."""
-        mesh, mass = read_mesh(given.mesh), given.mass
-        parts = convex_parts(mesh) if given.parts is None else check_parts(given.parts)
+    def _body(self, given: "Solid", parts: "Sequence[trimesh.Trimesh] | None", mass: float | None = None) -> Body:
+        """Return a body in the simulator's frame; its parts are cut in the frame of the trial."""
+        mesh, parts = read_solid(given, parts)
         if mass is None:
             mass = self.spec.mass if self.spec.density is None else self.spec.density * float(mesh.volume)
         if self.trial.table is not None:

@@ -46,9 +46,21 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))
     1
     """
+    return _cut(read_mesh(mesh), cache)
+
+
+def read_solid(
+    mesh: "trimesh.Trimesh | Path | str", parts: "Sequence[trimesh.Trimesh] | None"
+) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
+    """Return a closed mesh (`read_mesh`) and the convex parts that make it up: the given parts, or its own."""
+    mesh = read_mesh(mesh)
+    return mesh, _cut(mesh, None) if parts is None else check_parts(parts)
+
+
+def _cut(mesh: "trimesh.Trimesh", cache: Path | str | None) -> "list[trimesh.Trimesh]":
+    """Return convex parts of a checked mesh, from the cache or cut anew."""
     import trimesh
 
-    mesh = read_mesh(mesh)
     if mesh.is_convex:
         return [hull(mesh.vertices)]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
