@@ -13,63 +13,52 @@ from torchgrasp.limits import MESH_BYTES
 from torchgrasp.sim.convex_parts import check_parts
 
 
-def open_box():
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    return trimesh.Trimesh(box.vertices, box.faces[:-1])
+def cube(size: float = 0.1) -> trimesh.Trimesh:
+    return trimesh.creation.box((size, size, size))
 
 
-def inside_out():
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    return trimesh.Trimesh(box.vertices, box.faces[:, ::-1], process=False)
+def changed(vertices=lambda x: x, faces=lambda x: x) -> trimesh.Trimesh:
+    """A cube with other vertices or faces."""
+    return trimesh.Trimesh(vertices(np.array(cube().vertices)), faces(np.array(cube().faces)), process=False)
 
 
-def flat():
-    """A closed surface around nothing."""
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    return trimesh.Trimesh(box.vertices * [1, 1, 0], box.faces, process=False)
+def turned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A mesh with its faces turned inward."""
+    mesh.invert()
+    return mesh
 
 
-def one_face_turned():
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    faces = np.array(box.faces)
-    faces[0] = faces[0, ::-1]
-    return trimesh.Trimesh(box.vertices, faces, process=False)
-
-
-def one_body_turned():
-    """A box, and apart from it a smaller one inside out: the volume is positive, and the inertia is not."""
-    box, turned = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.08, 0.08, 0.08))
-    turned.invert()
-    return trimesh.util.concatenate([box, turned.apply_translation((0.3, 0.0, 0.0))])
-
-
-def not_finite():
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    vertices = np.array(box.vertices)
+def not_finite(vertices):
     vertices[0, 0] = np.nan
-    return trimesh.Trimesh(vertices, box.faces, process=False)
+    return vertices
+
+
+def one_turned(faces):
+    faces[0] = faces[0, ::-1]
+    return faces
 
 
 @pytest.mark.parametrize(
     ("mesh", "reason"),
     [
-        (open_box, "open surface"),
-        (inside_out, "volume"),
-        (not_finite, "non-finite"),
-        (flat, "volume"),
-        (one_face_turned, "volume"),
-        (one_body_turned, "without inertia"),
-        (lambda: trimesh.Trimesh(), "of 0 faces"),
+        (changed(faces=lambda x: x[:-1]), "open surface"),
+        (changed(faces=lambda x: x[:, ::-1]), "volume"),
+        (changed(not_finite), "non-finite"),
+        (changed(lambda x: x * [1, 1, 0]), "volume"),
+        (changed(faces=one_turned), "volume"),
+        (trimesh.util.concatenate([cube(), turned(cube(0.08)).apply_translation((0.3, 0, 0))]), "without inertia"),
+        (trimesh.Trimesh(), "of 0 faces"),
     ],
+    ids=["open", "inside out", "not finite", "flat", "one face turned", "one body turned", "empty"],
 )
-def test_bad_meshes_are_refused(mesh, reason):
+def test_read_mesh_refuses_what_is_no_body(mesh, reason):
     with pytest.raises(MeshError, match=reason):
-        read_mesh(mesh())
+        read_mesh(mesh)
 
 
 def test_a_mesh_of_a_plane_is_refused(tmp_path):
     """Its surface is closed, but its corners have two numbers: the third of every `v` is missing."""
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box = cube()
     lines = [f"v {x} {y}" for x, y, _ in box.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces]
     (tmp_path / "flat.obj").write_text("\n".join(lines) + "\n")
     with pytest.raises(MeshError, match="expected "):
@@ -77,14 +66,12 @@ def test_a_mesh_of_a_plane_is_refused(tmp_path):
 
 
 def test_a_hollow_body_is_sound():
-    hole = trimesh.creation.box((0.08, 0.08, 0.08))
-    hole.invert()
-    assert read_mesh(trimesh.util.concatenate([trimesh.creation.box((0.1, 0.1, 0.1)), hole])).volume < 0.001
+    assert read_mesh(trimesh.util.concatenate([cube(), turned(cube(0.08))])).volume < 0.001
 
 
 def test_groups_and_materials_of_an_obj_are_left_out(tmp_path):
     """Their reading took minutes; a corner with two textures made the surface open."""
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box = cube()
     corners = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices) + "vt 0 0\nvt 1 0\nvt 0 1\n"
     faces = "".join(f"o {k}\nusemtl {k}\nf {a + 1}/1 {b + 1}/2 {c + 1}/3\n" for k, (a, b, c) in enumerate(box.faces))
     empty = "".join(f"g {k}\nusemtl {k}\n" for k in range(20_000))
@@ -97,7 +84,7 @@ def test_groups_and_materials_of_an_obj_are_left_out(tmp_path):
 @pytest.mark.parametrize("suffix", [".zip", ".3mf", ".dae", ".gltf", ".xyz", ""])
 def test_a_file_that_packs_or_names_others_is_no_mesh(tmp_path, suffix):
     path = tmp_path / f"box{suffix}"
-    trimesh.creation.box((0.1, 0.1, 0.1)).export(path, file_type="ply")
+    cube().export(path, file_type="ply")
     with pytest.raises(MeshError, match=r"expected a mesh file \(\.obj.*no such file"):
         read_mesh(path)
 
@@ -115,7 +102,7 @@ def test_bad_files_are_refused(tmp_path):
     with pytest.raises(MeshError):
         read_mesh(tmp_path / "noise.ply")
     path = tmp_path / "box.ply"
-    trimesh.creation.box((0.1, 0.1, 0.1)).export(path)
+    cube().export(path)
     assert read_mesh(str(path)).volume == pytest.approx(1e-3)
 
 
@@ -123,7 +110,7 @@ def test_bad_files_are_refused(tmp_path):
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".off"])
 def test_a_box_of_every_format_is_read_and_opens_nothing_else(tmp_path, suffix):
     path, opened = tmp_path / f"box{suffix}", []
-    content = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type=suffix[1:])
+    content = cube().export(file_type=suffix[1:])
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     if suffix == ".obj":
         path.write_text(f"mtllib ../secret.mtl\nusemtl a\n{path.read_text()}")
@@ -173,7 +160,7 @@ def test_a_mesh_beyond_the_limits_is_refused_before_it_is_read(tmp_path, monkeyp
         read_mesh(path)
     monkeypatch.setattr("torchgrasp.geometry.mesh.MESH_FACES", 11)
     with pytest.raises(MeshError, match="of 12 faces"):
-        read_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
+        read_mesh(cube())
 
 
 def test_too_many_parts_are_refused_before_they_are_looked_at():
@@ -183,7 +170,7 @@ def test_too_many_parts_are_refused_before_they_are_looked_at():
 
 def test_what_a_reader_logs_stays_with_it(tmp_path, caplog):
     """A number too many on a line is no fault of the corners; trimesh tells of it with a traceback."""
-    text = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl_ascii")
+    text = cube().export(file_type="stl_ascii")
     (tmp_path / "box.stl").write_text(text.replace("normal ", "normal x ", 1))
     with contextlib.suppress(MeshError):
         read_mesh(tmp_path / "box.stl")
@@ -196,9 +183,9 @@ def test_what_other_threads_log_meanwhile_is_kept(tmp_path, caplog, monkeypatch)
         thread.start()
         thread.join()
         trimesh.util.log.error("of this")
-        return trimesh.creation.box((0.1, 0.1, 0.1))
+        return cube()
 
     monkeypatch.setattr(trimesh, "load_mesh", read_beside_another)
-    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "box.stl")
+    cube().export(tmp_path / "box.stl")
     read_mesh(tmp_path / "box.stl")
     assert [record.message for record in caplog.records] == ["of another"]

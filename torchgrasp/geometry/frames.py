@@ -15,8 +15,7 @@ from torchgrasp.errors import DegenerateContacts
 from torchgrasp.geometry.linalg import unit
 
 MIN_HEIGHT_RATIO = 1e-3
-"""Least height of the largest contact triangle over its longest side. At a height of 1e-4 m, noise of 1e-6 m turns the
-virtual frame by 0.01 rad."""
+"""Least height of the largest contact triangle over its longest side: noise turns the frame of a flatter one."""
 
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
@@ -105,7 +104,7 @@ def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
 
 
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
-    """Tell which contacts lie too near to a line: their largest triangle is too flat, see `MIN_HEIGHT_RATIO`."""
+    """Return which contacts lie near a line: their largest triangle is flatter than `MIN_HEIGHT_RATIO`."""
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
     sides = corners - corners.roll(1, dims=-2)
     longest = torch.linalg.vector_norm(sides, dim=-1).amax((-1, -2))

@@ -20,7 +20,7 @@ def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
 
 
 def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-    """Return `unit` of vectors whose squares may overflow or vanish, and the same bits of all others."""
+    """Return `unit` of vectors whose squares may overflow or vanish; all other vectors have the bits of `unit`."""
     exponent = torch.frexp(v.abs().amax(-1, keepdim=True)).exponent - 1
     return unit(v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent))  # a power of two rounds nothing
 
@@ -55,8 +55,8 @@ def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"
 def solve_least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]) -> Float[Tensor, "k"]:
     """Return the shortest x that minimises |rows x - values|, by singular values.
 
-    `torch.linalg.lstsq` is not used: its driver for processors begins with column pivots that it never sets, so the
-    same system is solved with other last digits from call to call.
+    `torch.linalg.lstsq` is not used: on a processor it does not set its first column pivots, so the last digits differ
+    from call to call.
 
     >>> solve_least_squares(torch.tensor([[1.0], [1.0]]), torch.tensor([1.0, 3.0])).round(decimals=6)
     tensor([2.])
@@ -109,7 +109,7 @@ def farthest_points(
         first: index of the point to begin with.
         tie: relative difference of distances that counts as none; of equally far points the first is taken.
         distance: the distance of each point from one of them.
-        before: points that come first, of which none is returned; with any, `first` is not used.
+        before: points that count as picked before, and are not returned; with any, `first` is not used.
 
     >>> farthest_points(torch.tensor([[0.0], [1.0], [9.0]]), 2)
     tensor([0, 2])
@@ -129,7 +129,7 @@ def farthest_points(
 
 
 def _farthest_on_cpu(points: np.ndarray, count: int, first: int, tie: float) -> np.ndarray:
-    """Return `farthest_points` by NumPy, whose calls cost a quarter of torch's: a fit makes hundreds of picks."""
+    """Return `farthest_points` by NumPy, whose calls are quicker than torch's for few points."""
     x, picks = np.ascontiguousarray(points.T), np.full(count, first)
     nearest = np.full(len(points), np.inf, dtype=x.dtype)
     for k in range(1, count):

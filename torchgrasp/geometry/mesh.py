@@ -1,4 +1,4 @@
-"""Triangle meshes: read and checked, cut along a field, and closest points of triangles."""
+"""Triangle meshes: reading and checks, cutting along a field, closest points of triangles."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12
-"""Volume [m^3] from which on a mesh is a body: a cube of 0.1 mm."""
+"""Least volume [m^3] of a body."""
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":

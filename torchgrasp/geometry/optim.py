@@ -15,14 +15,12 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, pick, put
 
-LARGEST_STEP = 0.3
-"""Largest step of any variable of `LeastSquares` in one iteration, where the problem names none."""
 SOLVED = 0.1
-"""Sum of squared residuals at which `LeastSquares` is solved: 0.3 mm in the root."""
+"""Sum of squared residuals at which a row of `LeastSquares` ends."""
 STALLED = 0.02
-"""A row of `LeastSquares` rests after a step that lowers its sum by less than this share."""
+"""Relative decrease of the sum of squares below which a row of `LeastSquares` has converged."""
 LOST = 30.0
-"""A row of `LeastSquares` rests when a step is refused in spite of this damping."""
+"""Damping beyond which a refused step ends a row of `LeastSquares`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Linearisation(Batch):
 
 Damping = Float[Tensor, "a"]
 Steps = tuple[Float[Tensor, "a d"], Bool[Tensor, "a"]]
-"""A step of each row, and whether the row takes it; a row that does not is left alone from then on."""
+"""A step of each row, and whether the row goes on; a row that does not has ended."""
 Verdict = tuple[Bool[Tensor, "a"], Damping]
 """Which steps are accepted, and the damping of the next ones."""
 State = TypeVar("State", bound=Batch)
@@ -107,15 +105,19 @@ class LinearResiduals(Linearisation):
 
 @dataclasses.dataclass(frozen=True)
 class LeastSquares(Problem[State, LinearResiduals]):
-    """The sum of squared `residuals` of each row, which is done below `solved`; `moved` gives states after a step.
+    """The sum of squared residuals of each row.
 
-    A row rests, with infinite damping, when a step gained too little or damping does not help.
+    Args:
+        residuals: returns residuals and Jacobian of some rows at their states.
+        moved: returns the states after a step.
+        solved: sum of squares at which a row ends.
+        largest: largest change of a variable in one step.
     """
 
     residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
     moved: Callable[[State, Float[Tensor, "a d"]], State]
     solved: float = SOLVED
-    largest: float = LARGEST_STEP
+    largest: float = 0.3
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
         """Evaluate residuals, Jacobian and the sum of squares."""

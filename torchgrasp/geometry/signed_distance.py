@@ -15,20 +15,13 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.mesh import closest_on_triangles
 
 BAND = 0.026
-"""Distance [m] from the surface within which each second node is exact: that of a palm's spheres, with clearance."""
+"""Distance [m] from the surface within which every second node is exact: the reach of a palm's collision spheres."""
 NEAR, INWARD = 3, 5
-"""Spacings from the surface within which every node is exact, outside and inside, where distances have ridges; farther
-off cubics err by .1 mm (docs/speed.md)."""
+"""Spacings from the surface, outside and inside, within which every node is exact; other nodes are interpolated."""
 FAR_SHARE = 8
-"""Samples of the surface for each that serves nodes beyond the band, off by 1 mm, in a quarter of the time."""
-NEAREST_SAMPLES = 3
-"""Nearest samples whose triangles a node tries: with two, twice as many nodes are off by .1 mm; a third costs 5 %."""
-
+"""One of so many samples of the surface is used for nodes beyond the band."""
 FIELD_SPACING = 0.004
-"""Distance [m] between nodes that tell touches where a surface is: they err by less than the surface itself."""
-
-LEAF = 32
-"""Samples in a leaf of their tree: a quarter less time than with SciPy's 10, the same distances."""
+"""Spacing [m] of nodes with an error below that of an estimated surface."""
 
 
 @checked
@@ -55,7 +48,7 @@ class SignedDistanceField(Value):
 
     @checked(gradients=True)
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the value [m] at the nearest node, at most 0.87 spacings off; outside the grid it is too small."""
+        """Return the value [m] at the nearest node, at most 0.87 spacings away; outside the grid it is too small."""
         flat = 0
         for x, low, count in zip(points.unbind(-1), self.origin.to(points), self.values.shape, strict=True):
             node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
@@ -137,9 +130,9 @@ def _keep(known: np.ndarray) -> np.ndarray:
 
 
 def _refine(values: np.ndarray) -> np.ndarray:
-    """Return values of a grid twice as fine: cubics through the distances, with the sign of the node before.
+    """Return values of a grid twice as fine: cubics through the distances, with the sign of the previous node.
 
-    The sign of an open mesh jumps far from it, where a cubic through signed distances would err by centimetres.
+    Far from an open mesh the sign jumps, and a cubic through signed distances would be wrong.
     """
     sign, distance = values < 0, np.abs(values)
     for axis in range(3):
@@ -148,7 +141,7 @@ def _refine(values: np.ndarray) -> np.ndarray:
 
 
 def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
-    """Return values with one more between each two along an axis: by a cubic, a sign that of the one before."""
+    """Return values with one more between each two along an axis: a cubic, or the previous value of a sign."""
     known = np.moveaxis(values, axis, 0)
     fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=known.dtype)
     fine[::2] = known
@@ -161,7 +154,7 @@ def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 class _Surface:
-    """A tree of samples of a mesh, by which near triangles are found."""
+    """A search tree over samples of a mesh, which finds near triangles."""
 
     def __init__(self, vertices: Tensor, faces: Tensor):
         from scipy.spatial import KDTree
@@ -183,13 +176,13 @@ class _Surface:
         self.owner = np.concatenate([np.arange(len(area)), owner])
         self.triangles, self.normals = corners, _pseudonormals(corners)
         samples = np.concatenate([corners.mean(1), samples])
-        self.tree, self.few = KDTree(samples, leafsize=LEAF), KDTree(samples[::FAR_SHARE], leafsize=LEAF)
+        self.tree, self.few = KDTree(samples, leafsize=32), KDTree(samples[::FAR_SHARE], leafsize=32)
 
     def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3); `far` tries the nearest of few samples."""
+        """Return the signed distances [m] of points (n, 3); `far` uses fewer samples."""
         parts, tree, owners = [], self.few if far else self.tree, self.owner[::FAR_SHARE] if far else self.owner
         for part in (points[k : k + 8192] for k in range(0, max(1, len(points)), 8192)):
-            _, index = tree.query(part, k=1 if far else min(NEAREST_SAMPLES, len(owners)))
+            _, index = tree.query(part, k=1 if far else min(3, len(owners)))
             owner = owners[index.reshape(len(part), -1)]
             feet, feature = closest_on_triangles(np.repeat(part, owner.shape[1], 0), self.triangles[owner.reshape(-1)])
             gap = part[:, None] - feet.reshape(*owner.shape, 3)
@@ -219,7 +212,7 @@ def _pseudonormals(corners: np.ndarray) -> np.ndarray:
 
 
 def _alike(points: np.ndarray) -> np.ndarray:
-    """Return the same number for equal points (n, 3), and no others."""
+    """Return a number for each point (n, 3); equal points have equal numbers."""
     order = np.lexsort(points.T)
     new = (points[order[1:]] != points[order[:-1]]).any(1)
     number = np.empty(len(points), dtype=np.int64)
@@ -228,5 +221,5 @@ def _alike(points: np.ndarray) -> np.ndarray:
 
 
 def _sum_by(number: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return the sums of vectors (n, 3) of the same number."""
+    """Return the sums of the vectors (n, 3) that have the same number."""
     return np.stack([np.bincount(number, weights=column) for column in vectors.T], 1)
