@@ -230,7 +230,7 @@ def test_bad_starting_points_are_refused(ellipsoid):
     with pytest.raises(BadArgument, match="finite"):
         plan_contacts(ellipsoid, starts=far * torch.nan)
     four = torch.zeros(2, 4, 3, dtype=torch.float64)
-    with pytest.raises(BadArgument, match="starts: expected as many as spec, got 4 contacts a row"):
+    with pytest.raises(BadArgument, match=r"starts: expected .*got 4 contacts a row"):
         plan_contacts(ellipsoid, starts=four)
     with pytest.raises(BadArgument, match="start_radius"):
         plan_contacts(dataclasses.replace(ellipsoid, domain_radius=0.5))

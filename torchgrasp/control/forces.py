@@ -11,7 +11,7 @@ from torchgrasp.checks import Positive, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.plan.internal_forces import least_friction_forces
+from torchgrasp.plan.forces import least_friction_forces
 from torchgrasp.values import Grasps
 
 

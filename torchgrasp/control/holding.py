@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.plan.internal_forces import least_friction_forces
+from torchgrasp.plan.forces import least_friction_forces
 
 MAX_FACTOR = 1.5
 """Largest factor on the forces; it bounds the force if a sensor reads too little."""

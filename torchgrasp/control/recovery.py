@@ -16,7 +16,7 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ratio
+from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
 
 SPEED, CAREFUL_SPEED, ACCELERATION = 0.2, 0.08, 1.0
 """Largest speed [m/s] of the approach, largest speed [m/s] after a touch, and acceleration [m/s^2]."""

@@ -19,7 +19,7 @@ from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.closure_probability import closure_share
-from torchgrasp.plan.internal_forces import least_friction_forces, tangential_ratio
+from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import Contacts, Grasps
 

@@ -2,7 +2,7 @@
 
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import ClosureProbability, closure_probability
-from torchgrasp.plan.internal_forces import least_friction_forces
+from torchgrasp.plan.forces import least_friction_forces
 from torchgrasp.plan.problem import Shape
 from torchgrasp.plan.solve import plan_contacts
 

@@ -9,7 +9,6 @@ from torchgrasp.control.paper.impedance import (
     ROTATION_STIFFNESS,
     TRANSLATION_STIFFNESS,
     Impedance,
-    grasp_map,
     restoring_wrench,
     shared_forces,
     side_lengths,
@@ -17,6 +16,7 @@ from torchgrasp.control.paper.impedance import (
 )
 from torchgrasp.control.paper.stability import PreferredForces, StabilityModel
 from torchgrasp.geometry.frames import rigid, rotation_from_vector, virtual_frame
+from torchgrasp.plan.forces import grasp_map
 
 
 def triangles(count: int, seed: int = 0) -> torch.Tensor:

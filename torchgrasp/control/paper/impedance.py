@@ -22,21 +22,14 @@ from torchgrasp.control.observation import Observation
 from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import low_pass
-from torchgrasp.geometry.frames import degenerate, rigid, skew, virtual_frame
-from torchgrasp.plan.internal_forces import internal_forces
+from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
+from torchgrasp.plan.forces import grasp_map, internal_forces
 
 TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0
 """Stiffness of the virtual frame [N/m, N m/rad]."""
 
 GRASP_STIFFNESS = 100.0
 """Stiffness [N/m] of the spring along each side of the triangle of fingertips."""
-
-
-def grasp_map(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6 9"]:
-    """Return the map from three forces at `points` to force and torque about their centre."""
-    arms = points - points.mean(-2, keepdim=True)
-    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
-    return torch.cat([torch.cat([eye] * 3, -1), torch.cat(skew(arms).unbind(-3), -1)], -2)
 
 
 def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:

@@ -8,10 +8,10 @@ import torch
 from scipy.optimize import linprog
 
 from torchgrasp.geometry.frames import rotation_from_vector
-from torchgrasp.plan.cone_forces import forces_in_cones
-from torchgrasp.plan.internal_forces import (
-    _rounds,
-    _search_weights,
+from torchgrasp.plan.forces import (
+    _search_steps,
+    central_forces,
+    grasp_map,
     internal_forces,
     least_friction_forces,
     tangential_ratio,
@@ -67,7 +67,7 @@ def least_ratio(points, normals):
 
 
 @FINGERTIPS
-def test_internal_forces_balance(fingertips):
+def test_internal_forces_span_the_null_space_of_the_grasp_map(fingertips):
     points, _ = tripods(50, 0, fingertips)
     forces = internal_forces(points)
     assert forces.shape == (50, fingertips * (fingertips - 1) // 2, fingertips, 3)
@@ -75,10 +75,11 @@ def test_internal_forces_balance(fingertips):
     torques = torch.linalg.cross(points[:, None].expand_as(forces), forces)
     assert forces.sum(-2).abs().max() < 1e-12
     assert torques.sum(-2).abs().max() < 1e-12
+    assert (grasp_map(points)[:, None] @ forces.flatten(2)[..., None]).abs().max() < 1e-12
 
 
 @FINGERTIPS
-def test_balanced_forces_are_in_equilibrium_and_scaled(fingertips):
+def test_least_friction_forces_balance_and_are_scaled(fingertips):
     points, normals = tripods(64, 1, fingertips)
     forces = least_friction_forces(points, normals, 5.0)
     good = torch.isfinite(forces).all(-1).all(-1)
@@ -92,7 +93,7 @@ def test_balanced_forces_are_in_equilibrium_and_scaled(fingertips):
 
 
 @FINGERTIPS
-def test_least_friction_against_linear_programmes(fingertips):
+def test_least_friction_forces_agree_with_linear_programmes(fingertips):
     points, normals = tripods(12, 2, fingertips)
     forces = least_friction_forces(points, normals, 1.0)
     ratios = tangential_ratio(forces, normals).amax(-1)
@@ -104,7 +105,7 @@ def test_least_friction_against_linear_programmes(fingertips):
             assert oracle - 0.02 <= ratios[k] <= oracle + (0.05 if fingertips == 3 else 0.1)
 
 
-def test_thumb_is_the_sum_of_the_others_and_they_are_even():
+def test_least_friction_forces_of_a_pinch_are_even():
     points, normals = pinch()
     forces = least_friction_forces(points, normals, 6.0)
     push = -(forces * normals).sum(-1)
@@ -112,7 +113,7 @@ def test_thumb_is_the_sum_of_the_others_and_they_are_even():
     assert tangential_ratio(forces, normals).max() < 1e-2
 
 
-def test_forces_turn_with_the_frame():
+def test_least_friction_forces_turn_with_the_frame():
     points, normals = pinch()
     rotation = rotation_from_vector(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
     here = least_friction_forces(points, normals, 4.0) @ rotation.T
@@ -120,15 +121,15 @@ def test_forces_turn_with_the_frame():
     assert (here - there).abs().max() < 0.1
 
 
-def test_contacts_that_cannot_balance_are_nan():
+def test_least_friction_forces_are_nan_without_a_balance():
     points, normals = pinch()
     assert torch.isnan(least_friction_forces(points, normals[:1].expand(3, 3).contiguous(), 4.0)).all()
 
 
 @FINGERTIPS
-def test_the_method_of_centres_finds_the_least_friction(fingertips):
+def test_central_forces_need_the_least_friction(fingertips):
     points, normals = tripods(12, 4, fingertips)
-    forces = forces_in_cones(points, normals, points.new_ones(12, fingertips), 1e-3)
+    forces = central_forces(points, normals, points.new_ones(12, fingertips), 1e-3)
     ratios = tangential_ratio(forces, normals).amax(-1)
     compared = 0
     for k in range(12):
@@ -139,10 +140,10 @@ def test_the_method_of_centres_finds_the_least_friction(fingertips):
     assert compared >= 8
 
 
-def test_three_contacts_are_searched_and_centred_alike():
+def test_search_and_central_forces_agree():
     points, normals = tripods(40, 5)
     searched = tangential_ratio(least_friction_forces(points, normals), normals).amax(-1)
-    centred = tangential_ratio(forces_in_cones(points, normals, points.new_ones(40, 3), 1e-3), normals).amax(-1)
+    centred = tangential_ratio(central_forces(points, normals, points.new_ones(40, 3), 1e-3), normals).amax(-1)
     good = searched < 2.0
     assert int(good.sum()) > 25
     assert float((centred - searched)[good].max()) < 0.01  # the search also weighs evenness
@@ -150,7 +151,7 @@ def test_three_contacts_are_searched_and_centred_alike():
 
 
 @pytest.mark.parametrize("uneven", [False, True])
-def test_few_sets_of_three_contacts_and_many_are_searched_alike(uneven):
+def test_least_friction_forces_do_not_depend_on_the_batch(uneven):
     points, normals = tripods(20, 8)
     preferred = points.new_tensor([1.0, 2.0, 3.0]).expand(20, 3) if uneven else None
     together = least_friction_forces(points, normals, 4.0, preferred)
@@ -161,30 +162,22 @@ def test_few_sets_of_three_contacts_and_many_are_searched_alike(uneven):
 
 
 @FINGERTIPS
-def test_no_contacts_need_no_forces(fingertips):
+def test_least_friction_forces_of_an_empty_batch(fingertips):
     nothing = torch.zeros(2, 0, fingertips, 3)
     assert least_friction_forces(nothing, nothing).shape == nothing.shape
     assert least_friction_forces(nothing[0], nothing[0], 4.0, nothing[0, ..., 0]).shape == nothing.shape[1:]
 
 
-def test_contacts_on_the_cpu_are_searched_whatever_the_default_device_is():
+def test_least_friction_forces_ignore_the_default_device():
     points, normals = tripods(1, 8)
     here = least_friction_forces(points, normals)
-    _rounds.cache_clear()
+    _search_steps.cache_clear()
     with torch.device("meta"):
         there = least_friction_forces(points, normals)
     torch.testing.assert_close(there, here, rtol=0, atol=0)
 
 
-def test_arrays_need_no_device():
-    """They have none before NumPy 2."""
-    former = type("Former", (np.ndarray,), {"device": property()})
-    push, slide = np.random.default_rng(0).normal(size=(2, 3, 3)), np.random.default_rng(1).normal(size=(2, 9, 3))
-    for found, now in zip(_search_weights(np, push.view(former), slide), _search_weights(np, push, slide), strict=True):
-        np.testing.assert_array_equal(found, now)
-
-
-def test_four_fingers_against_a_thumb_press_with_a_quarter_each_or_as_is_preferred():
+def test_least_friction_forces_of_five_fingers_follow_the_preferred_ones():
     corners = [[0.03, y, z] for y, z in ((-0.02, -0.02), (-0.02, 0.02), (0.02, -0.02), (0.02, 0.02))]
     points = torch.tensor([*corners, [-0.03, 0.0, 0.0]], dtype=torch.float64)
     normals = torch.tensor([[1.0, 0, 0]] * 4 + [[-1.0, 0, 0]], dtype=torch.float64)
@@ -198,7 +191,7 @@ def test_four_fingers_against_a_thumb_press_with_a_quarter_each_or_as_is_preferr
 
 
 @pytest.mark.parametrize("fingertips", [4, 5])
-def test_forces_of_more_contacts_turn_with_the_frame_and_know_no_row_beside(fingertips):
+def test_forces_of_more_contacts_turn_with_the_frame(fingertips):
     points, normals = tripods(20, 6, fingertips)
     rotation = rotation_from_vector(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
     here = least_friction_forces(points, normals, 4.0)
@@ -209,7 +202,7 @@ def test_forces_of_more_contacts_turn_with_the_frame_and_know_no_row_beside(fing
     torch.testing.assert_close(least_friction_forces(points[7], normals[7], 4.0), here[7], rtol=0, atol=1e-9)
 
 
-def test_more_contacts_that_cannot_balance_are_nan_and_harm_no_other():
+def test_forces_of_more_contacts_are_nan_without_a_balance():
     points, normals = tripods(3, 7, 4)
     alone = least_friction_forces(points, normals)
     assert bool(torch.isfinite(alone).all())

@@ -1,0 +1,236 @@
+"""Balanced forces of three to five contacts that need the least friction.
+
+Forces that balance lie in the null space of the grasp map. For three contacts the space has three dimensions, which a
+push along each side of the triangle spans, and a search over directions finds the best forces. For four and five
+contacts the forces are F = N z, with normal parts a_i and tangential parts t_i. The friction cones of a tangent tau
+have an analytic centre, the minimum of
+
+    sum c_i a_i - sum log(tau^2 a_i^2 - |t_i|^2).
+
+Newton steps follow the centre while tau falls towards the ratio that the forces need [1]. The c_i = 2 / (preferred
+normal force) also fix the scale.
+
+[1] Boyd and El Ghaoui, Linear Algebra and its Applications 188, 1993.
+"""
+
+import functools
+import math
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.checks import ANY, Positive, checked
+from torchgrasp.geometry.frames import skew
+from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
+from torchgrasp.plan.closure_lp import solve_closure_lp
+from torchgrasp.plan.problem import contact_pairs, pull_signs
+from torchgrasp.plan.wrench import Vectors, centre_and_radius, wrenches
+
+DIRECTIONS, NEIGHBOURS, REFINEMENTS, SHRINK = 1024, 128, 12, 0.55
+"""The search tries all directions, then neighbours of the best in rounds, each of a smaller radius by `SHRINK`."""
+EVENNESS = 0.01
+"""Weight of the ratio of the largest to the least normal force, against the tangent needed."""
+PREFERENCE = 0.2
+"""Weight of the distance from the preferred proportions, against the tangent needed."""
+SLACK = 0.04
+"""Tangent that four or five contacts may need beyond the least one, so that their forces are more even."""
+STEPS, KEPT = 30, 0.3
+"""Newton steps, and the share of tau's distance from the needed ratio that remains after each step."""
+MAX_FRICTION = 10.0
+"""Tangent of the widest friction cones in which forces are sought."""
+
+
+def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
+    """Return the map from the n = 3 f numbers of the forces at `points` to force and torque about their centre.
+
+    >>> grasp_map(torch.eye(3)).shape
+    torch.Size([6, 9])
+    """
+    arms = points - points.mean(-2, keepdim=True)
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
+    return torch.cat([torch.cat([eye] * arms.shape[-2], -1), torch.cat(skew(arms).unbind(-3), -1)], -2)
+
+
+def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"]:
+    """Return unit pushes between the p pairs of contacts: `[..., k, i, :]` is the force at contact i under push k.
+
+    The forces and torques of each push cancel. The pushes span the null space of the grasp map, except for four or
+    five contacts in one plane. The order of pairs is that of `contact_pairs`.
+
+    >>> internal_forces(torch.eye(3)).sum(1).abs().max()
+    tensor(0.)
+    """
+    f = points.shape[-2]
+    first, second = contact_pairs(f, points.device)
+    sides = unit(points[..., second, :] - points[..., first, :])
+    return pull_signs(f, points.device).to(points).T[..., None] * sides[..., None, :]
+
+
+def tangential_ratio(forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b f"]:
+    """Return the ratio of tangential to normal force; infinite where a contact does not push."""
+    push = -(forces * normals).sum(-1)
+    tangential = torch.linalg.vector_norm(forces + push[..., None] * normals, dim=-1)
+    return torch.where(push > 0, tangential / push.clamp_min(1e-12), torch.inf)
+
+
+@checked
+def least_friction_forces(
+    points: Annotated[Float[Tensor, "*b f 3"], ANY],
+    normals: Annotated[Float[Tensor, "*b f 3"], ANY],
+    strongest: Positive = 4.0,
+    preferred: Annotated[Float[Tensor, "*#b f"], ANY] | None = None,
+) -> Float[Tensor, "*b f 3"]:
+    """Return the balanced forces of the fingers on the object [N] that need the least friction.
+
+    The forces of three contacts lie in the friction cones whenever any balanced forces do, up to the weight of even
+    forces. The forces of four or five contacts may need a slightly larger tangent than the least one.
+
+    Args:
+        points: contacts [m].
+        normals: outward unit normals of the object.
+        strongest: normal force of the strongest finger [N].
+        preferred: proportions of the normal forces, preferred among forces of similar friction; None: equal.
+
+    Returns:
+        Forces; NaN rows where no balanced forces push at all contacts.
+
+    >>> points = torch.tensor([[[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]]])
+    >>> normals = torch.tensor([[[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]])
+    >>> least_friction_forces(points, normals, 2.0)[0, :, 0].round(decimals=2)
+    tensor([ 1.,  1., -2.])
+    """
+    rows = (-1, *points.shape[-2:])
+    p, n = points.double().reshape(rows), normals.double().reshape(rows)
+    if preferred is not None:
+        preferred = (preferred / preferred.amax(-1, keepdim=True)).double()
+        preferred = preferred.expand(points.shape[:-1]).reshape(-1, points.shape[-2])
+    if points.shape[-2] == 3:
+        forces = _search_forces(p, n, preferred)
+    else:  # every finger has to push
+        wanted = p.new_ones(p.shape[:-1]) if preferred is None else preferred.clamp(min=0.05)
+        forces = central_forces(p, n, wanted, SLACK)
+    forces = forces.to(points).reshape(points.shape)
+    push = -(forces * normals).sum(-1)
+    return forces * (strongest / push.amax(-1))[..., None, None]
+
+
+def _search_forces(
+    points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], preferred: Float[Tensor, "b 3"] | None
+) -> Float[Tensor, "b 3 3"]:
+    """Return the forces of three contacts, of any scale; NaN where none push everywhere."""
+    sides = points[:, [1, 2, 0]] - points
+    sides = sides / ((sides * sides).sum(-1) ** 0.5)[..., None]
+    basis = pull_signs(3, points.device).T[..., None] * sides[:, :, None]
+    push = -(basis * normals[:, None]).sum(-1)
+    slide = (basis + push[..., None] * normals[:, None]).reshape(-1, 3, 9).swapaxes(1, 2)
+    push = push.swapaxes(1, 2)  # (b, 3, 3): normal force at each contact by each push
+    row = torch.arange(len(points), device=points.device)
+    weights = torch.zeros_like(push[:, 0])
+    best, costs = row, weights
+    for steps in _search_steps():
+        tried = weights[:, :, None] + steps.to(push.device)
+        normal, across = push @ tried, slide @ tried
+        ratio = ((across * across).unflatten(1, (3, 3)).sum(2) / (normal * normal)).amax(1) ** 0.5
+        least, most = normal.amin(1), normal.amax(1)
+        if preferred is None:
+            uneven = EVENNESS * most / least
+        else:
+            off = normal / most[:, None] - preferred[..., None]
+            uneven = PREFERENCE * (off * off).sum(1) ** 0.5
+        costs = torch.where(least > 1e-12, ratio + uneven, torch.inf)
+        best = costs.argmin(-1)
+        weights = tried[row, :, best]
+        weights = weights / (weights * weights).sum(-1)[:, None] ** 0.5
+    forces = (weights[:, None] @ basis.reshape(-1, 3, 9)).reshape(-1, 3, 3)
+    return torch.where(torch.isfinite(costs[row, best])[:, None, None], forces, torch.nan)
+
+
+@functools.cache
+def _search_steps() -> tuple[Float[Tensor, "3 s"], ...]:
+    """Return the steps that each round of the search tries: all directions first, then shorter and shorter ones."""
+    with torch.device("cpu"):  # whatever the default device is
+        first, near = (fibonacci_sphere(n, GOLDEN_ANGLE, 0.0) for n in (DIRECTIONS, NEIGHBOURS))
+        around = torch.cat([near.new_zeros(1, 3), near]).T
+    radii = 4 / math.sqrt(DIRECTIONS) * SHRINK ** np.arange(REFINEMENTS)
+    return first.T.contiguous(), *(radius * around for radius in radii.tolist())
+
+
+def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "b f"], slack: float) -> Vectors:
+    """Return balanced forces that need nearly the least friction, near the preferred normal forces.
+
+    Args:
+        points: contacts, in any unit.
+        normals: outward unit normals.
+        preferred: normal forces.
+        slack: tangent of the cones beyond the ratio needed. More slack gives forces nearer to the preferred ones.
+
+    Returns:
+        Forces; NaN rows where no balanced forces push at every contact within `MAX_FRICTION`.
+    """
+    basis = _null_space(points)  # (b, f, 3, k)
+    push = -(normals[..., None] * basis).sum(2)  # (b, f, k): a = push z
+    slide = basis + normals[..., None] * push[:, :, None]
+    pushes, slides = push[..., :, None] * push[..., None, :], slide.mT @ slide
+    start = torch.einsum("bfik,bfi->bk", basis, -preferred[..., None] * normals)
+    pulls = ~((push @ start[..., None])[..., 0] > 0).all(1)
+    found = _pushing_forces(points[pulls], normals[pulls])
+    start = start.index_put((pulls,), torch.einsum("bfik,bfi->bk", basis[pulls], found))
+    linear = (2 / preferred[..., None] * push).sum(1)
+    z = start * (2 * points.shape[1] / (linear * start).sum(1))[:, None]
+    ratio = _needed(push, slide, z)
+    tau = 1.1 * ratio + slack
+    row, lengths = torch.arange(len(z), device=z.device), 2 ** torch.arange(5, device=z.device).to(z)
+    for _ in range(STEPS):
+        cone = tau.square()[:, None, None, None] * pushes - slides  # (b, f, k, k)
+        half = (cone @ z[:, None, :, None])[..., 0]
+        height = (half * z[:, None]).sum(-1, keepdim=True)
+        scaled = 2 * half / height
+        gradient = linear - scaled.sum(1)
+        hessian = scaled.mT @ scaled - (2 * cone / height[..., None]).sum(1)
+        factor, _ = torch.linalg.cholesky_ex(hessian)
+        step = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+        decrement = (-(gradient * step).sum(1)).clamp(min=0).sqrt()
+        # Multiples of a step that is safe for every self-concordant function.
+        tried = z[:, None] + (lengths / (1 + decrement[:, None]))[..., None] * step[:, None]  # (b, l, k)
+        normal, tangential = _sizes(push, slide, tried)
+        widest = tau[:, None, None] * normal
+        logs = ((widest - tangential).log() + (widest + tangential).log()).sum(-1)
+        value = (tried @ linear[..., None])[..., 0] - logs
+        z = tried[row, torch.where(torch.isfinite(value), value, torch.inf).argmin(1)]
+        ratio = _needed(push, slide, z)
+        # Farther from the centre tau would fall faster than the steps can follow.
+        tau = torch.where(decrement < 1.0, ratio + (KEPT * (tau - ratio)).clamp(min=slack), tau)
+    return (basis @ z[:, None, :, None])[..., 0]
+
+
+def _pushing_forces(points: Vectors, normals: Vectors) -> Vectors:
+    """Return balanced forces that push at every contact, NaN where there are none within `MAX_FRICTION`."""
+    wrench = wrenches(points, normals, MAX_FRICTION, edges=4)
+    phi, _ = solve_closure_lp(wrench.flatten(1, 2))
+    forces = (phi.unflatten(1, wrench.shape[1:3])[..., None] * wrench[..., :3]).sum(2)
+    return torch.where((phi.amin(-1) > 0)[:, None, None], forces, torch.nan)
+
+
+def _null_space(points: Vectors) -> Float[Tensor, "b f 3 k"]:
+    """Return an orthonormal basis of the k = 3 f - 6 dimensions of forces that balance."""
+    wrench = grasp_map(points / centre_and_radius(points)[1])
+    return torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:].unflatten(1, points.shape[1:])
+
+
+def _sizes(
+    push: Float[Tensor, "b f k"], slide: Float[Tensor, "b f 3 k"], z: Float[Tensor, "b l k"]
+) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:
+    """Return the normal and tangential forces of l combinations."""
+    tangential = (slide.flatten(1, 2) @ z.mT).unflatten(1, slide.shape[1:3])  # (b, f, 3, l)
+    return z @ push.mT, torch.linalg.vector_norm(tangential, dim=2).mT
+
+
+def _needed(
+    push: Float[Tensor, "b f k"], slide: Float[Tensor, "b f 3 k"], z: Float[Tensor, "b k"]
+) -> Float[Tensor, "b"]:
+    """Return the greatest ratio of tangential to normal force."""
+    normal, tangential = _sizes(push, slide, z[:, None])
+    return (tangential / normal)[:, 0].amax(1)
