@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchgrasp.control.forces import joint_stiffness, tip_compliance
+from torchgrasp.control.forces import contacts_in_hand, joint_stiffness, tip_compliance
 from torchgrasp.control.law import (
     FORCE_BANDWIDTH,
     FORCE_FLOOR,
@@ -26,10 +26,10 @@ from torchgrasp.control.law import (
 )
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.control.reference import ClosingReference, closing_gains
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
-from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.hand.load import load_hand
-from torchgrasp.values import Certificate, Contacts, Grasps
 
 
 def draw(*shape, seed=0):
@@ -41,31 +41,11 @@ def directions(*shape, seed=0):
     return v / v.norm(dim=-1, keepdim=True)
 
 
-def grasp_of(hand, std=0.004):
-    """A grasp whose contacts are where the fingertips of the middle posture are."""
-    joints = (0.5 * (hand.lower + hand.upper))[None]
-    obj_from_hand = rigid(rotation_from_vector(draw(1, 3, seed=3)), draw(1, 3, seed=4))
-    points, normals = hand.fingertips(joints)
-    one = torch.ones(1, dtype=torch.float64)
-    contacts = Contacts(
-        points=apply(obj_from_hand, points),
-        normals=-rotate(obj_from_hand, normals),
-        std_m=std * torch.ones(1, 3, dtype=torch.float64),
-    )
-    return Grasps(
-        joints=joints,
-        pregrasp=joints,
-        approach=rotate(obj_from_hand, hand.approach[None].double())[:, 0],
-        obj_from_hand=obj_from_hand,
-        contacts=contacts,
-        permutation=torch.tensor([[0, 1, 2]]),
-        tip_error=torch.zeros(1, 3, dtype=torch.float64),
-        clearance=one,
-        normal_angle=torch.zeros(1, 3, dtype=torch.float64),
-        certificate=Certificate(one, one, one, torch.tensor([True]), torch.zeros(1, 6)),
-        score=one,
-        status=torch.zeros(1, dtype=torch.int64),
-    )
+def shipped(name):
+    """A hand, its grasp of the jug, and the grasp's contacts in the hand's frame."""
+    hand, grasp = load_hand(name), load_shipped_grasp("jug", name)
+    points, normals = contacts_in_hand(grasp)
+    return hand, grasp, points[0], normals[0]
 
 
 def test_eq26_blend_is_the_gaussian_of_the_error():
@@ -177,40 +157,35 @@ def test_eq25_posture_moves_no_fingertip():
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_closing_gains_are_in_the_hands_frame(name):
-    hand = load_hand(name)
-    grasp = grasp_of(hand)
+    hand, grasp, points, normals = shipped(name)
     gains = closing_gains(grasp, hand, 5.0)
-    points, pads = hand.fingertips(grasp.joints)
-    assert torch.allclose(gains.target, points[0])
-    assert torch.allclose(gains.covariance, surface_covariance(pads[0], grasp.contacts.std_m[0]))
+    assert torch.allclose(gains.target, points)
+    assert torch.allclose(gains.covariance, surface_covariance(normals, grasp.contacts.std_m[0].double()))
     assert torch.allclose(gains.position_gain, position_gain(gains.covariance))
     assert ((gains.force_gain > 0) & (gains.force_gain < 0.1)).all()
-    push = (gains.desired_force * pads[0]).sum(-1)
-    assert float(push.max()) == pytest.approx(5.0)
-    here = rotate(inverse(grasp.obj_from_hand), -grasp.contacts.normals)[0]
-    assert torch.allclose(here, pads[0])
+    assert float(-(gains.desired_force * normals).sum(-1).min()) == pytest.approx(5.0)
+    assert torch.allclose(apply(grasp.obj_from_hand.double(), points[None]), grasp.contacts.points.double(), atol=1e-6)
 
 
 def test_closing_gains_press_unbalanced_contacts_along_their_normals():
-    hand = load_hand("allegro")
-    grasp = grasp_of(hand)
+    hand, grasp, *_ = shipped("allegro")
     same = grasp.contacts.normals[:, :1].expand(1, 3, 3).contiguous()
     grasp = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, normals=same))
     gains = closing_gains(grasp, hand, 5.0)
-    assert torch.allclose(gains.desired_force, -5.0 * rotate(inverse(grasp.obj_from_hand), same)[0])
+    assert torch.allclose(gains.desired_force, -5.0 * rotate(inverse(grasp.obj_from_hand.double()), same.double())[0])
     assert torch.isfinite(gains.force_gain).all()
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_eq28_force_gains_follow_the_learned_variance(name):
     """Along its normal a loop has the bandwidth C_F over the compliance; no finger's force is known exactly."""
-    hand, model = load_hand(name), load_stability(load_hand(name))
-    grasp = grasp_of(hand)
+    (hand, grasp, points, normals), model = shipped(name), load_stability(load_hand(name))
     gains = ClosingReference.from_grasp(hand, grasp, 4.0, stability=model).gains
-    centres, (_, pads) = hand.tip_centres(grasp.joints)[0], hand.fingertips(grasp.joints)
-    variance = model.preferred_forces(centres).covariance.diagonal()
-    sigma = variance[:, None] * pads[0] ** 2 + FORCE_FLOOR**2
-    compliance = tip_compliance(hand.jacobian(grasp.joints), pads, joint_stiffness(hand))[0]
+    hand = hand.to("cpu", torch.float64)
+    variance = model.preferred_forces(points + hand.tips.radius[:, None] * normals).covariance.diagonal()
+    sigma = variance[:, None] * normals**2 + FORCE_FLOOR**2
+    jacobian = hand.jacobian(grasp.joints.double(), points[None])
+    compliance = tip_compliance(jacobian, normals[None], joint_stiffness(hand))[0]
     expected = FORCE_BANDWIDTH * compliance[:, None] * (variance.min() + FORCE_FLOOR**2) / sigma
     assert torch.allclose(gains.force_gain, expected, rtol=1e-6)
     assert gains.force_source == "stability"
@@ -230,22 +205,15 @@ def test_tip_compliance_is_the_motion_for_a_newton():
 
 
 def test_closing_gains_refuse_bad_arguments():
-    hand = load_hand("allegro")
-    grasp = grasp_of(hand)
+    hand, grasp, *_ = shipped("allegro")
     with pytest.raises(BadArgument, match=r"grasp: expected .*got 0 rows"):
         closing_gains(grasp[:0], hand)
     with pytest.raises(BadArgument, match=r"grasps: expected .*got 12 joints"):
-        closing_gains(grasp, load_hand("barrett"))
-    with pytest.raises(BadArgument, match=r"obj_from_hand: expected .*got nan"):
-        dataclasses.replace(grasp, obj_from_hand=grasp.obj_from_hand * float("nan"))
-    spoilt = dataclasses.replace(
-        grasp, contacts=dataclasses.replace(grasp.contacts, std_m=grasp.contacts.std_m * float("inf"))
-    )
-    with pytest.raises(BadArgument, match=r"std_m: expected .*got inf"):
-        closing_gains(spoilt, hand)
-    unknown = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, std_m=None))
-    with pytest.raises(BadArgument, match=r"std_m: expected .*got None"):
-        closing_gains(unknown, hand)
+        closing_gains(dataclasses.replace(grasp, meta={}), load_hand("barrett"))
+    contacts = grasp.contacts
+    for std_m, found in ((contacts.std_m * float("inf"), "inf"), (None, "None")):
+        with pytest.raises(BadArgument, match=rf"std_m: expected .*got {found}"):
+            closing_gains(dataclasses.replace(grasp, contacts=dataclasses.replace(contacts, std_m=std_m)), hand)
     for force in (0.0, -1.0, float("nan")):
         with pytest.raises(BadArgument, match="force"):
             closing_gains(grasp, hand, force)

@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.laws.scenes import check_scene
 from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.mount import APPROACH_JOINT, LIFT_JOINT, euler_from_rotation, mounted_urdf
+from torchgrasp.sim.scene import open_scene
 from torchgrasp.sim.scene_spec import SHIFT_JOINTS, SceneSpec
 
 
@@ -48,15 +50,15 @@ def test_mounted_urdf_refuses_files_that_are_no_hand(tmp_path):
         mounted(tmp_path / "two.urdf")
 
 
-SIMULATORS = ["sapien", "mujoco"]
+def simulated(test):
+    """Run a test in both simulators."""
+    both = [pytest.param(name, marks=pytest.mark.sim) for name in ("sapien", "mujoco")]
+    return pytest.mark.filterwarnings("ignore")(pytest.mark.parametrize("simulator", both)(test))
 
 
 def build(name, mesh, simulator="sapien", **options):
     """A scene with the hand half a metre above the object."""
     pytest.importorskip(simulator)
-    from torchgrasp.sim.scene import open_scene
-    from torchgrasp.sim.scene_spec import SceneSpec
-
     hand = load_hand(name)
     joints = 0.5 * (hand.lower + hand.upper)
     pose = np.eye(4)
@@ -72,9 +74,7 @@ def standing(radius=0.03, height=0.12):
     return mesh
 
 
-@pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@simulated
 @pytest.mark.parametrize("timestep", [1 / 240, 1 / 500])
 def test_scene_supports_the_objects_weight(timestep, simulator):
     *_, scene = build("barrett", standing(), simulator, timestep=timestep)
@@ -86,9 +86,7 @@ def test_scene_supports_the_objects_weight(timestep, simulator):
     assert np.abs(scene.object_pose() - np.eye(4)).max() < 1e-4
 
 
-@pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@simulated
 def test_scene_object_has_the_inertia_of_its_mesh(simulator):
     radius, height, mass = 0.03, 0.12, 0.36
     mesh = standing(radius, height)
@@ -109,14 +107,10 @@ def test_scene_object_has_the_inertia_of_its_mesh(simulator):
 
 
 @pytest.mark.promise("N13")
-@pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@simulated
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_scene_obeys_check_scene(name, simulator):
     pytest.importorskip(simulator)
-    from torchgrasp.sim.scene import open_scene
-
     check_scene(lambda spec: open_scene(spec, simulator), load_hand(name))
 
 
@@ -128,15 +122,9 @@ BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iy
   <collision><geometry><sphere radius="0.1"/></geometry></collision>"""
 
 
-@pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@simulated
 def test_jacobian_of_sliding_joints_is_along_their_axes(tmp_path, simulator):
     pytest.importorskip(simulator)
-    from torchgrasp.hand.hand import Actuator
-    from torchgrasp.sim.scene import open_scene
-    from torchgrasp.sim.scene_spec import SceneSpec
-
     kinds = [("prismatic", "1 0 0"), ("prismatic", "0 0 1"), ("revolute", "0 1 0")]
     fingers = "".join(SLIDER.format(k=k, kind=d, axis=x, body=BODY) for k, (d, x) in enumerate(kinds, start=1))
     (tmp_path / "hand.urdf").write_text(SLIDING.format(body=BODY, fingers=fingers))
@@ -157,9 +145,7 @@ def test_jacobian_of_sliding_joints_is_along_their_axes(tmp_path, simulator):
     assert np.abs(found - expected).max() < 1e-3
 
 
-@pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@simulated
 def test_scene_pulls_at_the_mass_centre_and_lifts_at_a_speed(simulator):
     mesh = standing()
     mesh.apply_translation([0.3, 0.0, 0.0])
@@ -174,14 +160,9 @@ def test_scene_pulls_at_the_mass_centre_and_lifts_at_a_speed(simulator):
     assert scene.hand_pose()[2, 3] - 0.6 == pytest.approx(0.02, abs=3e-4)
 
 
-@pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@simulated
 def test_open_scene_refuses_joints_without_a_drive(simulator):
     pytest.importorskip(simulator)
-    from torchgrasp.sim.scene import open_scene
-    from torchgrasp.sim.scene_spec import SceneSpec
-
     mesh, hand = standing(), load_hand("barrett")
     setup = SceneSpec(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tips.links, mesh, [mesh], 0.1)
     with pytest.raises(BadArgument, match=r"no position or drive for .*spread"):
@@ -190,9 +171,7 @@ def test_open_scene_refuses_joints_without_a_drive(simulator):
         open_scene(setup, "bullet")
 
 
-@pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("simulator", SIMULATORS)
+@simulated
 def test_yielding_mount_shifts_and_lifts_the_hand(simulator):
     *_, world_from_hand, scene = build("barrett", standing(), simulator, yields=0.02)
     scene.shift(np.array([0.02, -0.01, 0.005]))
