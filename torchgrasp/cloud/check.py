@@ -39,7 +39,7 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
     """Check a cloud and return it without copies of its points, which would count as independent measurements.
 
-    Of points closer than 1e-9 of the extent the first stays. Raises the errors of `check_cloud`.
+    Of points closer than 1e-9 of the extent only the first is kept. Raises the errors of `check_cloud`.
     """
     points = _check(cloud)
     rows = _distinct_rows(points)

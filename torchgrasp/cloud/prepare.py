@@ -151,7 +151,7 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     directions = unit(normals)
     cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
     height = ((points[index[:, 1:]] - points[:, None]) * directions[:, None]).sum(-1).abs()
-    # Across an edge of 45 degrees signs say nothing; a point far over the tangent plane may be behind a thin wall.
+    # Signs are not compared across an edge of 45 degrees, nor far over the tangent plane, maybe behind a thin wall.
     compared = (cosine.abs() > 0.7) & (height <= 0.3 * distance[:, 1:])
     against = compared & (cosine < 0)
     pairs = int(compared.sum())

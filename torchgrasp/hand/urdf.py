@@ -200,20 +200,10 @@ def _joint(joint: ET.Element) -> Joint:
     length = length if _is_unit(length) else 1.0  # refused later
     limits = {} if limit is None else {key: float(word) for key, word in limit.attrib.items()}
     ends = {} if kind == "continuous" else limits
-    return Joint(
-        name,
-        kind,
-        parent,
-        child,
-        xyz,
-        rpy,
-        (x / length, y / length, z / length),
-        ends.get("lower", -math.inf),
-        ends.get("upper", math.inf),
-        limits.get("effort", 0.0),
-        limits.get("velocity", 0.0),
-        None if mimic is None else Mimic(mimic.attrib["joint"], *_floats(mimic, "multiplier", "offset")),
-    )
+    unit, low, high = (x / length, y / length, z / length), ends.get("lower", -math.inf), ends.get("upper", math.inf)
+    drive = limits.get("effort", 0.0), limits.get("velocity", 0.0)
+    follows = None if mimic is None else Mimic(mimic.attrib["joint"], *_floats(mimic, "multiplier", "offset"))
+    return Joint(name, kind, parent, child, xyz, rpy, unit, low, high, *drive, follows)
 
 
 def _is_unit(length: float) -> bool:
