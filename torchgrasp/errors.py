@@ -46,7 +46,7 @@ class SuspiciousScale(BadArgument):
 
 
 class NoSupport(BadArgument):
-    """A scene shows no plane that things stand on, or more than one."""
+    """A scene shows no supporting plane, or more than one."""
 
 
 class CloudFileError(BadArgument):
@@ -111,23 +111,23 @@ class FailedRows(GraspError):
 
 
 class CloudWarning(UserWarning):
-    """A view whose shape is a guess in part; the message says where and why."""
+    """A part of a view is ambiguous; the message says where and why."""
 
 
 class CutOff(CloudWarning):
-    """The border of the image cuts the object off."""
+    """The object reaches the border of the image."""
 
 
 class Gap(CloudWarning):
-    """Within the outline nothing was measured: a hole, or a patch that mirrors."""
+    """A region within the outline has no points: a hole, or a reflecting patch."""
 
 
 class TwoBodies(CloudWarning):
-    """The cloud shows two bodies that stand apart."""
+    """The cloud shows two separate bodies."""
 
 
 class Status(enum.IntEnum):
-    """The outcome of one row of a batch; `sentence` explains it to the user.
+    """The outcome of one row of a batch; `sentence` explains it.
 
     >>> Status.NOT_CLOSED.sentence
     'the contacts do not resist every wrench at the planned friction (no frictional form closure)'

@@ -1,6 +1,6 @@
-"""The value types of the data flow, in its order: the map of the library. Options stand in `specs`.
+"""The values of the data flow, in its order. Options are in `torchgrasp.specs`.
 
-A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths are metres.
+A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths are in metres.
 Positions are in the frame of the cloud ("obj") unless said otherwise. `a_from_b` maps coordinates of frame b into a.
 
 Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five), e friction-cone edges, h actuated
@@ -20,20 +20,17 @@ from torchgrasp.checks import ANY, Poses, Rows, checked, is_rigid
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import read_value, save_tensors
 
-# ---------------------------------------------------------------------------------------------- what was seen
-
-
 @checked
 @dataclasses.dataclass(frozen=True)
 class PointCloud(Value):
-    """A point cloud of one object, as a camera saw it.
+    """The visible points of one object.
 
     Args:
         points: surface points [m], at least 4.
-        normals: outward normals, or None. Functions that use them normalise them.
-        viewpoint: position of the camera [m]; (n, 3) gives one camera for each point; None: unknown.
-        frustum: inward unit normals of the four sides of the camera's view, or of each point's; None: unknown. What
-            reaches a side goes on beyond it.
+        normals: outward normals of any length, or None.
+        viewpoint: position of the camera [m], or of each point's camera; None: unknown.
+        frustum: inward unit normals of the four sides of the camera's view, or of each point's view; None: unknown. An
+            object that reaches a side continues beyond it.
 
     Raises:
         BadArgument: wrong shape, dtype or non-finite numbers.
@@ -51,7 +48,7 @@ class PointCloud(Value):
     frustum: Float[Tensor, "4 3"] | Float[Tensor, "n 4 3"] | None = None
 
     def __post_init__(self) -> None:
-        """Check the number of points once, where the value is made."""
+        """Check the number of points."""
         if len(self.points) < 4:
             raise TooFewPoints("points", f"{len(self.points)} points", "at least 4 points")
 
@@ -95,8 +92,8 @@ class ShapeEstimate(Value):
     """The posterior of the shape at query points (Eqs. 7-8).
 
     `distance`, `variance` and `covariance` are in the normalised units of the paper: one unit is `shape.scale` metres.
-    So `max_variance=0.03` means what it means in the paper. `normal` is the unit gradient of the mean. `std_m` is the
-    calibrated standard deviation of the surface position [m]: that of the distance over the slope of the mean.
+    `normal` is the unit gradient of the mean. `std_m` [m] is the calibrated standard deviation of the surface's position:
+    the deviation of the distance over the slope of the mean.
     """
 
     distance: Float[Tensor, "*b"]
@@ -106,16 +103,13 @@ class ShapeEstimate(Value):
     std_m: Float[Tensor, "*b"]
 
 
-# --------------------------------------------------------------------------------------------- where to touch
-
-
 @checked
 @dataclasses.dataclass(frozen=True)
 class Contacts(Batch):
     """Three to five contacts a row, one for each fingertip: `points` [m] and outward unit `normals`.
 
-    `variance` (Eq. 12, normalised units) and `std_m` [m] say how uncertain the surface is there. They are None where
-    nobody knows, as for contacts of another planner. All have one dtype.
+    `variance` (Eq. 12, normalised units) and `std_m` [m] are the uncertainty of the surface at the contacts, or None if
+    it is unknown, as for contacts of another planner. All tensors have one dtype.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts
@@ -129,7 +123,7 @@ class Contacts(Batch):
     std_m: Annotated[Float[Tensor, "b f"], ANY] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse tensors of two precisions: torch would, in words of its own and much later."""
+        """Refuse tensors of two precisions."""
         found = {str(x.dtype) for x in (self.points, self.normals, self.variance, self.std_m) if x is not None}
         if len(found) > 1:
             raise BadArgument("contacts", " beside ".join(sorted(found)), "one dtype for all")
@@ -164,13 +158,12 @@ class ContactPlan(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """The proof that contacts have frictional form closure (Eq. 13), or that they lack it; see `certify`.
+    """The proof that contacts have frictional form closure (Eq. 13), or that they do not; see `certify`.
 
     `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio` is the smallest over the largest
     singular value of W, torques divided by the radius of the contacts. `residual` is the largest |W phi|. `closed`
-    needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13), too. `witness` is a unit
-    wrench w with w . v >= -margin for every edge wrench v. If the contacts are not closed, w separates: no contact
-    force opposes it.
+    needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13) too. `witness` is a unit
+    wrench w with w . v >= -margin for every edge wrench v. If the contacts are not closed, no contact force opposes w.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -178,9 +171,6 @@ class Certificate(Batch):
     residual: Annotated[Float[Tensor, "b"], ANY]
     closed: Bool[Tensor, "b"]
     witness: Annotated[Float[Tensor, "b 6"], ANY]
-
-
-# ------------------------------------------------------------------------------------- how this hand can touch
 
 
 @checked
@@ -200,7 +190,7 @@ class ContactCode(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSeeds(Batch):
-    """Starts of the inverse kinematics: postures placed on contacts by their virtual frames (Eq. 24).
+    """Initial guesses of the inverse kinematics: postures placed on contacts by their virtual frames (Eq. 24).
 
     `row` is the row of the contacts, `permutation` the contact of each finger. `energy` is the least f_i of Eq. (21),
     or half the squared distance of a library posture. `tip_error` [m] is the distance of each fingertip from its
@@ -223,8 +213,7 @@ class Grasps(Batch):
     Finger i touches contact i. `pregrasp` is the joints of the opened hand at the same pose; `approach` is the unit
     direction of its straight path there. `clearance` [m] is the least distance of the links from the estimated
     surface, from each other and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle
-    between pad axis and contact direction. `score` ranks the grasps, or says what ranking them by success would be:
-    `plan_grasps` makes it the log-odds of `success`.
+    between pad axis and contact direction. `score` is the log-odds of the predicted success, which ranks the grasps.
     `meta` holds names, units, hashes and the seed as text.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -267,7 +256,7 @@ def load_grasps(path: Path | str) -> Grasps:
     """Read grasps that `Grasps.save` wrote.
 
     Raises:
-        ModelFileError: no such file; a pose that is not rigid, an unknown status, or not three to five contacts.
+        ModelFileError: no such file, a pose that is not rigid, an unknown status, or not three to five contacts.
 
     >>> import tempfile
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -281,7 +270,7 @@ def load_grasps(path: Path | str) -> Grasps:
 
 
 def check_grasps(path: Path | str, grasps: Grasps) -> None:
-    """Refuse grasps of a file that no program of ours wrote; raise `ModelFileError`."""
+    """Raise `ModelFileError` for grasps of a file that `Grasps.save` cannot have written."""
     f = grasps.contacts.fingertips
     wrong = {
         f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]]),

@@ -259,7 +259,12 @@ def read_scene(path: Path | str) -> Scene:
 
     Raises:
         CloudFileError: no such file, or malformed content.
-        BadArgument: what `Scene.from_depth` refuses.
+        BadArgument: as `Scene.from_depth`.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_scene
+    >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).target
+    1
     """
     arrays = read_arrays(Path(path))
     table, pose = arrays.pop("table", None), arrays.pop("camera_pose", None)
