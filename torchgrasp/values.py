@@ -20,6 +20,7 @@ from torchgrasp.checks import ANY, Poses, Rows, checked, is_rigid
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import read_value, save_tensors
 
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class PointCloud(Value):
