@@ -93,7 +93,7 @@ class ShapeEstimate(Value):
     """The posterior of the shape at query points (Eqs. 7-8).
 
     `distance`, `variance` and `covariance` are in the normalised units of the paper: one unit is `shape.scale` metres.
-    `normal` is the unit gradient of the mean. `std_m` [m] is the calibrated standard deviation of the surface's position:
+    `normal` is the unit gradient of the mean. `std_m` [m] is the calibrated standard deviation of the surface:
     the deviation of the distance over the slope of the mean.
     """
 

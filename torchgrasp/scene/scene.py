@@ -263,8 +263,8 @@ def read_scene(path: Path | str) -> Scene:
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
-    >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).target
-    1
+    >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).things
+    (1, 2, 3, 4)
     """
     arrays = read_arrays(Path(path))
     table, pose = arrays.pop("table", None), arrays.pop("camera_pose", None)
