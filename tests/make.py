@@ -16,7 +16,7 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
 from torchgrasp.hand.hand import Hand
-from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.plan.closure import closed_exact
 from torchgrasp.posture_model.sample import HandSamples
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.gp import ShapeGP

@@ -7,10 +7,11 @@ import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from paper.cross_validation import CrossValidation, cross_validate
 from torchgrasp import load_hand
 from torchgrasp.files import write_file
 from torchgrasp.posture_model.sample import sample_configurations
-from torchgrasp.posture_model.selection import BicCurve, CrossValidation, bic_curve, cross_validate
+from torchgrasp.posture_model.score import BicCurve, bic_curve
 
 PUBLISHED = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians."""

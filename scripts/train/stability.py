@@ -38,11 +38,10 @@ from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.jobs import run_tasks
-from torchgrasp.posture_model.compatibility import describe_compatibility
-from torchgrasp.posture_model.em import expectation_maximisation
+from torchgrasp.posture_model.em import Shard, expectation_maximisation
+from torchgrasp.posture_model.encoding import describe_compatibility
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.kmeans import start_components
-from torchgrasp.posture_model.shard import Shard
 from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 SIZES = {

@@ -15,7 +15,7 @@ from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.joint import JointProblem, JointState, solve_joint
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
-from torchgrasp.plan.flatness import flatness_constraint
+from torchgrasp.plan.feasibility import flatness_constraint
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import normalise_tensions
 from torchgrasp.shape.surface import extract_surface

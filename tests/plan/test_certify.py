@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan import closure_lp
+from torchgrasp.plan import closure
 from torchgrasp.plan.certify import bound_margin, certify
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec
@@ -107,7 +107,7 @@ def test_highs_gives_the_same_certificates_where_the_batch_gives_none(generator,
     points, normals = leaning(generator, 40)
     spec = ContactSpec(friction=0.6, friction_margin=1.0, edges=edges)
     batch = certify(Contacts(points, normals), spec)
-    monkeypatch.setattr(closure_lp, "PIVOTS", 0)
+    monkeypatch.setattr(closure, "PIVOTS", 0)
     alone = certify(Contacts(points, normals), spec)
     assert torch.equal(batch.closed, alone.closed)
     torch.testing.assert_close(batch.margin, alone.margin, rtol=0, atol=1e-9)

@@ -8,7 +8,7 @@ import torch
 from tests.make import HALF_BALL_RADIUS as RADIUS
 from tests.make import contacts_on
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.line_posterior import FOOTPRINT, NODES, first_contact, grid, line_posterior
+from torchgrasp.plan.closure_probability import FOOTPRINT, NODES, first_contact, grid, line_posterior
 from torchgrasp.shape.posterior import combined_covariance, distance_covariance
 
 

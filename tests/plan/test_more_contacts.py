@@ -14,8 +14,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, degenerate, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.closure_lp import solve_closure_lp
-from torchgrasp.plan.round_cones import closed_exact, first_balance, most_opposing
+from torchgrasp.plan.closure import closed_exact, first_balance, most_opposing, solve_closure_lp
 from torchgrasp.plan.wrench import MIN_MARGIN, cone_edges, tangents, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts

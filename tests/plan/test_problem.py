@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.plan.closure import closed_exact
 from torchgrasp.plan.problem import (
     CONE_MARGIN,
     INSIDE,
@@ -20,7 +21,6 @@ from torchgrasp.plan.problem import (
     split_unknowns,
     triple_jet,
 )
-from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.specs import ContactSpec
 
 CPU = torch.device("cpu")

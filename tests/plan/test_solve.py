@@ -10,8 +10,7 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.feasibility import check_feasibility, first_violation
-from torchgrasp.plan.flatness import normal_variation
+from torchgrasp.plan.feasibility import check_feasibility, first_violation, normal_variation
 from torchgrasp.plan.solve import plan_chunk, plan_contacts
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.starts import draw_in, settle_flatness

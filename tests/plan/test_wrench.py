@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.plan.closure import closed_exact
 from torchgrasp.plan.wrench import (
     centre_and_radius,
     cone_edges,

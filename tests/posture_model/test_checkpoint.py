@@ -12,11 +12,10 @@ from tests.make import run_python
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import load_tensors
 from torchgrasp.posture_model.checkpoint import Checkpoint
-from torchgrasp.posture_model.em import Progress
+from torchgrasp.posture_model.em import Progress, Shard
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture
 from torchgrasp.posture_model.sample import HandSamples
-from torchgrasp.posture_model.shard import Shard
 
 
 def parameters(mixture: GraspMixture) -> torch.Tensor:

@@ -12,6 +12,7 @@ from torchgrasp.posture_model.em import (
     MAX_RESEEDS,
     Components,
     Progress,
+    Shard,
     coefficients_from_components,
     components_from_sums,
     expectation,
@@ -20,7 +21,6 @@ from torchgrasp.posture_model.em import (
     maximisation,
 )
 from torchgrasp.posture_model.kmeans import start_components
-from torchgrasp.posture_model.shard import Shard
 
 
 def clustered(n: int = 6000, d: int = 5, m: int = 4) -> torch.Tensor:
@@ -105,7 +105,7 @@ def test_start_finds_separate_clusters(generator):
 
 def test_fewer_different_rows_than_components_are_named():
     rows = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=torch.float64).repeat(50, 1)
-    with pytest.raises(BadArgument, match="components: expected at most 2, got 3"):
+    with pytest.raises(BadArgument, match=r"components: expected at most 2, .*got 3"):
         start_components(Shard(rows), 3, 0, 1e-6)
 
 

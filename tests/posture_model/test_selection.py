@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from paper.cross_validation import cross_validate
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
 from torchgrasp.posture_model.sample import HandSamples
-from torchgrasp.posture_model.score import evaluate_mixture
-from torchgrasp.posture_model.selection import bic_curve, cross_validate
+from torchgrasp.posture_model.score import bic_curve, evaluate_mixture
 
 
 def islands(n: int = 1500, m: int = 4) -> HandSamples:

@@ -11,8 +11,7 @@ from scipy.optimize import linprog
 from scipy.stats import kstest, rayleigh
 
 from torchgrasp.hand.load import load_hand
-from torchgrasp.posture_model.sample import sample_configurations
-from torchgrasp.posture_model.touch import ROLL, can_close, roll_contacts
+from torchgrasp.posture_model.sample import ROLL, can_close, roll_contacts, sample_configurations
 from torchgrasp.specs import ContactSpec
 
 

@@ -11,7 +11,7 @@ import torch
 from tests.make import covariance
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.closure_lp import solve_closure_lp
+from torchgrasp.plan.closure import solve_closure_lp
 from torchgrasp.plan.wrench import wrenches
 from torchgrasp.shape.conditioning import select_points
 from torchgrasp.shape.kernel import kernel_by_name, thin_plate

@@ -10,7 +10,7 @@ from benchmarks.plan.probability import HARD, draw_contacts, format_reliability,
 
 from tests.make import HALF_BALL_RADIUS as RADIUS
 from tests.make import half_ball as ball
-from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.plan.closure import closed_exact
 
 
 def _asked(power: float, n: int = 4000) -> list[dict]:

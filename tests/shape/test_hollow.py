@@ -10,7 +10,7 @@ from tests.make import cup, cup_view
 from tests.make import cylinder_points as ring
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.mesh import closest_on_triangles
-from torchgrasp.plan.line_posterior import line_posterior
+from torchgrasp.plan.closure_probability import line_posterior
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.hollow import HollowShape, Middle, tie_walls
 from torchgrasp.shape.surface import extract_surface

@@ -1,12 +1,15 @@
 """Grasps and surfaces in the formats of other programs, written and read."""
 
-from torchgrasp.export.benchmark_files import format_graspgen, save_dexgraspbench
-from torchgrasp.export.foreign import grasps_from_joints
-from torchgrasp.export.foreign_files import ForeignGrasps, read_foreign
-from torchgrasp.export.grasp_json import format_grasps
-from torchgrasp.export.mujoco_keyframes import format_keyframes
+from torchgrasp.export.foreign import ForeignGrasps, grasps_from_joints, read_foreign
+from torchgrasp.export.other_formats import (
+    check_surface_path,
+    format_graspgen,
+    largest_std,
+    save_dexgraspbench,
+    save_surface,
+)
+from torchgrasp.export.postures import format_grasps, format_keyframes
 from torchgrasp.export.ros_messages import format_moveit, format_trajectories
-from torchgrasp.export.surface_mesh import check_surface_path, largest_std, save_surface
 
 __all__ = [
     "ForeignGrasps",

@@ -1,17 +1,205 @@
-"""Grasps of other planners: joints and poses of the hand become `Grasps`."""
+"""Grasps of other planners, and our own JSON, become `Grasps`.
 
+DexGraspBench's .npy is a pickle, which could run code when it is read, so it is refused. Convert a file that you trust:
+
+    content = np.load("0.npy", allow_pickle=True).item()
+    np.savez("0.npz", grasp_qpos=content["grasp_qpos"], pregrasp_qpos=content["pregrasp_qpos"])
+"""
+
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Length, Poses, checked
+from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.control.law import damped_inverse
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, ModelFileError, Status
+from torchgrasp.export.other_formats import BENCH_HANDS, rotation_of
+from torchgrasp.files import Field, is_file, read_bytes, read_json
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.hand.hand import Hand
+from torchgrasp.limits import CLOUD_BYTES
 from torchgrasp.plan.certify import certify
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, Grasps
+
+MOST_GRASPS = 100_000
+"""Most grasps of a file: more are no plan of one object."""
+UNIT = 1e-3
+"""Largest difference from 1 of a quaternion's length in a file of few digits."""
+FAR = 100.0
+"""Largest number of a pose or posture [m, rad] in a JSON file."""
+
+Quaternion = Literal["wxyz", "xyzw"]
+
+
+class ForeignGrasps(NamedTuple):
+    """Joints [rad], poses of the hand's root link in the object's frame, and joints of the opened hand if known.
+
+    >>> poses = torch.eye(4).double().repeat(5, 1, 1)
+    >>> ForeignGrasps(torch.zeros(5, 12).double(), poses, pregrasp=None).joints.shape
+    torch.Size([5, 12])
+    """
+
+    joints: Float[Tensor, "g h"]
+    obj_from_hand: Float[Tensor, "g 4 4"]
+    pregrasp: Float[Tensor, "g h"] | None
+
+
+@checked
+def read_foreign(
+    path: Path | str, hand: Hand, order: Sequence[str] = (), quaternion: Quaternion = "wxyz"
+) -> ForeignGrasps:
+    """Read joints and poses from the grasps of another program, or from our own JSON.
+
+    | file | what is read |
+    | --- | --- |
+    | `.json` of `format_grasps` | joints by name, pose, pre-grasp |
+    | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of seven numbers and of joints, in the `order` given |
+    | `.npz` with `grasp_qpos` (DexGraspBench) | rows of pose and joints; `pregrasp_qpos`, if it is there |
+
+    Args:
+        path: the file.
+        hand: that grasps. DexGraspBench's frame and order of joints are known of the Allegro hand.
+        order: names of the joints in the file, those of the hand's URDF; joints of other names are left out.
+        quaternion: order of the numbers in a pose, after its position.
+
+    Raises:
+        BadArgument: an order that misses a joint of the hand.
+        ModelFileError: a missing or malformed file, or numbers that are not finite.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.export import format_grasps
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> file = Path(tempfile.mkdtemp(), "grasps.json")
+    >>> _ = file.write_text(format_grasps(hand, grasp))
+    >>> torch.allclose(read_foreign(file, hand).joints, grasp.joints, atol=1e-5)
+    True
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".npz":
+        return _read_bench(path, hand, tuple(order), quaternion)
+    content = read_json(path, _refuse, "a JSON file of grasps, or .npz").entries()
+    if "grasps" in content:
+        return _read_own(content["grasps"], hand)
+    if not {"pose", "dofs"} <= content.keys():
+        raise _refuse(f"{path}: fields {', '.join(content)[:80]}", "'grasps', or 'pose' and 'dofs'")
+    places = _places(hand, tuple(order))
+    pose = _table(content["pose"], 7)
+    dofs = _table(content["dofs"], len(order))
+    if len(pose) != len(dofs):
+        raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
+    return ForeignGrasps(torch.tensor(dofs[:, places]), _poses(pose, quaternion), None)
+
+
+def _refuse(found: str, allowed: str) -> ModelFileError:
+    """Return the error of a file of grasps."""
+    return ModelFileError("path", found, allowed)
+
+
+def _read_own(rows: Field, hand: Hand) -> ForeignGrasps:
+    """Read the rows of `format_grasps`."""
+    joints, opened, poses = list[list[float]](), list[list[float]](), list[list[float]]()
+    for row in rows.items(MOST_GRASPS):
+        fields = row.entries()
+        for named, values in (("grasp", joints), ("pregrasp", opened)):
+            posture = _entry(_entry(fields, "joints", row).entries(), named, row).entries()
+            values.append([_entry(posture, name, row).number(-FAR, FAR) for name in hand.joint_names])
+        pose = _entry(fields, "pose", row).entries()
+        position, quaternion = _entry(pose, "position", row), _entry(pose, "quaternion_wxyz", row)
+        poses.append([*_numbers(position, 3), *_numbers(quaternion, 4)])
+    h = len(hand.joint_names)
+    return ForeignGrasps(
+        torch.tensor(joints, dtype=torch.float64).reshape(-1, h),
+        _poses(np.array(poses, dtype=float).reshape(-1, 7), "wxyz"),
+        torch.tensor(opened, dtype=torch.float64).reshape(-1, h),
+    )
+
+
+def _entry(fields: dict[str, Field], name: str, row: Field) -> Field:
+    """Return a field of a row that must be there."""
+    if name not in fields:
+        raise _refuse(f"{row.path}: {row.place} without {name!r}", f"a field {name!r}")
+    return fields[name]
+
+
+def _table(field: Field, width: int) -> np.ndarray:
+    """Return a list of lists of so many numbers."""
+    return np.array([_numbers(row, width) for row in field.items(MOST_GRASPS)], dtype=float).reshape(-1, width)
+
+
+def _numbers(field: Field, count: int) -> list[float]:
+    """Return so many numbers, no more and no fewer."""
+    numbers = [x.number(-FAR, FAR) for x in field.items(count)]
+    if len(numbers) != count:
+        raise field.wrong(f"{count} numbers")
+    return numbers
+
+
+def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion) -> ForeignGrasps:
+    """Read an .npz with DexGraspBench's names; a file holds one grasp or rows of them."""
+    turn, known = BENCH_HANDS.get(hand.name, ([1.0, 0.0, 0.0, 0.0], ()))
+    order = order or tuple(known)
+    places, width = _places(hand, order), 7 + len(order)
+    if not is_file(path):
+        raise _refuse(f"{path}, which is no file", "an .npz with 'grasp_qpos'")
+    allowed = "an .npz of at most 512 MiB with 'grasp_qpos'"
+    try:
+        if path.stat().st_size > CLOUD_BYTES:
+            raise ValueError("a larger file")
+        tables = parse_npz(read_bytes(path), ("grasp_qpos", "pregrasp_qpos"), "grasp_qpos")
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
+        raise _refuse(f"{path}: {error}", allowed) from error
+    for name, table in tables.items():
+        good = table.dtype.kind == "f" and table.ndim in (1, 2) and table.shape[-1] == width
+        if not good or table.size > MOST_GRASPS * width or not np.isfinite(table).all():
+            found = f"{path}: {name} of shape {table.shape}, {table.dtype}"
+            raise _refuse(found, f"finite numbers (g, {width}): seven of the pose, {len(order)} joints")
+    rows = {name: table.reshape(-1, width).astype(float) for name, table in tables.items()}
+    if len({len(table) for table in rows.values()}) != 1:
+        raise _refuse(f"{path}: {', '.join(f'{len(x)} of {name}' for name, x in rows.items())}", "as many of either")
+    moved_from_root = torch.eye(4, dtype=torch.float64)
+    moved_from_root[:3, :3] = rotation_of(turn)
+    grasp, opened = rows["grasp_qpos"], rows.get("pregrasp_qpos")
+    return ForeignGrasps(
+        torch.tensor(grasp[:, 7:][:, places]),
+        _poses(grasp[:, :7], quaternion) @ moved_from_root,
+        None if opened is None else torch.tensor(opened[:, 7:][:, places]),
+    )
+
+
+def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
+    """Return where a file's order has each actuated joint."""
+    missing = [name for name in hand.joint_names if name not in order]
+    if missing or len(set(order)) != len(order):
+        found = f"{len(order)} names without {', '.join(missing[:4])}" if missing else "a name twice"
+        raise BadArgument("order", found, f"each of {', '.join(hand.joint_names)} once")
+    return [order.index(name) for name in hand.joint_names]
+
+
+def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
+    """Return poses from positions and quaternions."""
+    from scipy.spatial.transform import Rotation
+
+    turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
+    far = np.abs(np.linalg.norm(turns, axis=1) - 1) > UNIT
+    if far.any():
+        length = float(np.linalg.norm(turns[far][0]))
+        raise _refuse(f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}", "length 1")
+    matrices = Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
+    pose = torch.eye(4, dtype=torch.float64).repeat(len(numbers), 1, 1)
+    pose[:, :3, :3], pose[:, :3, 3] = torch.tensor(matrices), torch.tensor(numbers[:, :3])
+    return pose
+
 
 OPENING, OPENING_STEPS = 0.02, 4
 """How far [m] fingertips stand off where no pre-grasp is given, and in how many linear steps: within 1 mm."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.checks import Positive, Range, checked
 from torchgrasp.control.forces import squeeze
 from torchgrasp.control.paper.closings import POSE_TIME
-from torchgrasp.export.grasp_json import quaternion
+from torchgrasp.export.postures import quaternion
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE

@@ -23,8 +23,7 @@ from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differen
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.feasibility import check_feasibility
-from torchgrasp.plan.flatness import FlatnessConstraint, flatness_constraint
+from torchgrasp.plan.feasibility import FlatnessConstraint, check_feasibility, flatness_constraint
 from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, with_variance
 from torchgrasp.plan.solver import equal_tensions, normalise_tensions, project
 from torchgrasp.shape.values import SurfaceJet

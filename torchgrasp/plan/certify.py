@@ -1,7 +1,7 @@
 """Certificates of frictional form closure, Eq. (13): a verdict for every row of contacts, with its proof.
 
 The proof of closure is a balance phi. The proof against it is a witness: a wrench that no contact opposes. Either is
-checked, whoever found it: phi bounds the margin from below, the witness from above. A batched simplex (`closure_lp`)
+checked, whoever found it: phi bounds the margin from below, the witness from above. A batched simplex (`closure`)
 finds both. HiGHS decides where their bounds leave the verdict open.
 """
 
@@ -14,7 +14,7 @@ from torchgrasp.base import FINGERTIPS
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import degenerate
-from torchgrasp.plan.closure_lp import solve_closure_lp
+from torchgrasp.plan.closure import solve_closure_lp
 from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded

@@ -1,24 +1,184 @@
-"""The probability that planned contacts are closed on the real surface.
+"""The probability that contacts are closed on the true surface.
 
-Fingers come along the planned normals and stop on a surface drawn from the posterior (`line_posterior`). The draw
-counts if the touched points are closed for round cones.
+Each contact approaches along its normal. The Gaussian process of the shape is drawn along these lines, and the drawn
+surfaces give the points and normals at which the fingertips touch.
 """
 
 import dataclasses
+import functools
 from typing import Annotated
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.checks import FINITE, Range, Seed, checked
-from torchgrasp.plan.line_posterior import LinePosterior, first_contact, line_posterior, well_inside
-from torchgrasp.plan.round_cones import closed_exact, first_balance
+from torchgrasp.checks import FINITE, Range, Seed, check_tensor, checked
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.plan.certify import check_contacts, check_unit
+from torchgrasp.plan.closure import closed_exact, first_balance
+from torchgrasp.plan.wrench import Vectors, tangents
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.posterior import combined_covariance, symmetric_root
+from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Contacts
+
+FOOTPRINT = 0.012
+"""Half the width [m] over which a fingertip senses the slope of the surface: the radius of its sphere."""
+NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
+"""Nodes of a line, in standard deviations of the surface at its contact: three err by 0.07, five by 0.02 at most."""
+OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
+"""Outer half of the grid, in the same unit; it holds all nodes."""
+ROWS_PER_CHUNK = 32
+"""Rows whose joint posterior is made at a time: 105 x 105 distances of three contacts, which stay in the cache."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LinePosterior(Batch):
+    """The Gaussian of (d, w) on the lines x + t n, from outside in, normalised.
+
+    Args:
+        points: planned contacts x.
+        normals: outward unit normals n.
+        deviation: standard deviation of the surface at the contact, the unit of nodes and grid.
+        distance: mean of d on the grid.
+        slope: mean of w at the nodes.
+        root: symmetric root of the covariance of the z = 20 f values (d, w) at the nodes, line by line, node by node.
+    """
+
+    points: Vectors
+    normals: Vectors
+    deviation: Float[Tensor, "b f"]
+    distance: Float[Tensor, "b f 23"]
+    slope: Float[Tensor, "b f 5 3"]
+    root: Float[Tensor, "b z z"]
+
+
+@functools.cache
+def grid() -> Float[Tensor, "23"]:
+    """Return the grid in standard deviations, from outside in."""
+    return torch.tensor([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64)
+
+
+@functools.cache
+def grid_weights() -> Float[Tensor, "23 5"]:
+    """Return the weights of the nodes in the deviations on the grid.
+
+    >>> grid_weights()[[0, 3, 7, 9]].tolist()
+    [[1.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.5, 0.0, 0.0]]
+    """
+    return interpolation(grid(), torch.tensor(NODES, dtype=torch.float64))
+
+
+def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
+    """Return the weights of descending nodes at each place: linear between, constant outside."""
+    held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
+    gaps = nodes[:-1] - nodes[1:]
+    share = ((nodes[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
+    return torch.cat([torch.ones_like(held), share], -1) - torch.cat([share, torch.zeros_like(held)], -1)
+
+
+def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
+    """Tell which rows are a footprint or more inside the domain."""
+    radius = torch.linalg.vector_norm(shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1)
+    return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
+
+
+def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
+    """Return the posterior of the surface along the fingers' lines.
+
+    Raises:
+        BadArgument: contacts of a wrong shape, not finite, within a footprint of the domain's edge, or without unit
+            normals.
+    """
+    f = check_contacts(contacts).fingertips
+    for name, value in (("points", contacts.points), ("normals", contacts.normals)):
+        check_tensor(f"contacts.{name}", value, (len(contacts), f, 3))
+    points = shape.normalise(contacts.points.detach().double().to(shape.device))
+    normals = check_unit(contacts.normals.detach().double().to(shape.device))
+    if not bool(well_inside(shape, contacts).all()):
+        raise BadArgument("contacts.points", "a contact at the edge of the domain", "contacts further inside")
+    owner = shape.wall_at(points.flatten(0, 1)).unflatten(0, points.shape[:2])
+    deviation, distance, slope, covariance = _along_lines(shape.walls[0], shape.std_factor, points, normals)
+    if len(shape.walls) > 1:  # a finger meets the wall of its contact; errors of different walls are independent
+        covariance = covariance * _on_same(owner[..., 0])
+    for number, wall in enumerate(shape.walls[1:], start=1):
+        parts, own = _along_lines(wall, shape.std_factor, points, normals), owner[..., number]
+        deviation = torch.where(own, parts[0], deviation)
+        distance = torch.where(own[..., None], parts[1], distance)
+        slope = torch.where(own[..., None, None], parts[2], slope)
+        covariance = covariance + parts[3] * _on_same(own)
+    prior = float(shape.prior_block()[0, 0])
+    root = symmetric_root(shape.std_factor**2 * covariance, prior, "contacts within the domain")
+    return LinePosterior(points, normals, deviation, distance, slope, root)
+
+
+def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
+    """Tell which entries of the nodes' covariance belong to two contacts of a wall."""
+    own = own.repeat_interleave(4 * len(NODES), 1)
+    return own[:, :, None] & own[:, None]
+
+
+def _along_lines(
+    shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
+) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]]:
+    """Return deviation, distance on the grid, slope and covariance at the nodes for a single surface."""
+    jet = shape.jet(points.flatten(0, 1))
+    deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
+    nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
+    values = 4 * len(NODES) * points.shape[1]
+    covariance = points.new_empty(len(points), values, values)
+    for rows in torch.arange(len(points), device=points.device).split(ROWS_PER_CHUNK):
+        covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
+    slope = shape.mean_and_gradient((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
+    t = deviation[..., None] * grid().to(deviation)
+    distance = shape.mean((points[:, :, None] + t[..., None] * normals[:, :, None]).reshape(-1, 3))
+    return deviation, distance.reshape(t.shape), slope.reshape(*nodes.shape, 3), covariance
+
+
+def node_covariance(
+    shape: ShapeGP, points: Vectors, normals: Vectors, nodes: Float[Tensor, "b f 5"]
+) -> Float[Tensor, "b z z"]:
+    """Return the posterior covariance of (d, w) at the nodes, w by difference quotients of d.
+
+    Nodes outside the domain take the covariance at its edge.
+    """
+    width = FOOTPRINT / shape.scale
+    along = (points * normals).sum(-1)
+    half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
+    nodes = torch.maximum(torch.minimum(nodes, (half_chord - along)[..., None]), -(half_chord + along)[..., None])
+    first = tangents(points, normals)
+    axes = torch.stack([normals, first, torch.linalg.cross(normals, first)], 2)  # (b, line, axis, 3)
+    around = torch.cat([torch.zeros_like(axes[:, :, :1]), axes, -axes], 2) * width
+    places = points[:, :, None] + nodes[..., None] * normals[:, :, None]
+    queries = places[:, :, :, None] + around[:, :, None]  # (b, line, node, 7, 3)
+    weights = points.new_zeros(*points.shape[:2], 4, 7)
+    weights[..., 0, 0] = 1.0
+    weights[..., 1:, 1:] = torch.cat([axes, -axes], 2).mT / (2 * width)
+    return combined_covariance(shape, queries.flatten(1, 2), weights.repeat_interleave(len(NODES), 1))
+
+
+def first_contact(
+    lines: LinePosterior, drawn: Float[Tensor, "b n z"]
+) -> tuple[Float[Tensor, "b n f 3"], Float[Tensor, "b n f 3"]]:
+    """Return where the fingers stop for drawn deviations, and the normals there; NaN without a surface."""
+    deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
+    distance = lines.distance[:, None] + deviation[..., 0] @ grid_weights().to(drawn).T
+    crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
+    t = grid().to(drawn)
+    far = torch.where(crosses, t[:-1].abs(), torch.inf)
+    nearest, before = far.min(-1, keepdim=True)
+    high, low = distance.gather(-1, before), distance.gather(-1, before + 1)
+    stop = torch.lerp(t[before], t[before + 1], high / (high - low))
+    stop = torch.where(torch.isinf(nearest), torch.nan, stop)
+    weights = interpolation(stop, torch.tensor(NODES).to(stop))  # (b, n, f, 1, k)
+    slope = lines.slope[:, None] + deviation[..., 1:]
+    motion = stop * lines.deviation[:, None, :, None]
+    return lines.points[:, None] + motion * lines.normals[:, None], unit((weights @ slope)[..., 0, :])
+
 
 DRAWS_PER_CHUNK = 8192
 """Drawn rows that are judged at a time: their tensors take about 20 MB."""

@@ -1,18 +1,129 @@
-"""Whether contacts satisfy the problem, however they were found."""
+"""Whether contacts satisfy the problem: flatness of the surface around them, and every other constraint."""
+
+import dataclasses
+import math
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.base import Batch
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import degenerate
-from torchgrasp.plan.closure_lp import solve_closure_lp
-from torchgrasp.plan.flatness import normal_variation
-from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet
-from torchgrasp.plan.wrench import BALANCED, MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, wrenches
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.plan.closure import solve_closure_lp
+from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, walls_of
+from torchgrasp.plan.solver import project
+from torchgrasp.plan.wrench import (
+    BALANCED,
+    MIN_MARGIN,
+    MIN_RANK_RATIO,
+    Vectors,
+    cone_edges,
+    rank_ratio,
+    tangents,
+    wrenches,
+)
 from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
+
+JUDGED_POINTS, GUIDING_POINTS = 8, 4
+"""Points of the ring on which a plan is judged, and fewer that guide a solver."""
+INSIDE = 0.95
+"""Share of the largest variation that guiding points allow: the judged points lie between them."""
+
+
+def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
+    """Return n unit tangents around each contact: a cone of friction 1 without its axis."""
+    return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
+
+
+def normal_variation(
+    shape: Shape, points: Vectors, normals: Vectors, radius: float, among: Bool[Tensor, "b f"] | None = None
+) -> Float[Tensor, "b f"]:
+    """Return the largest angle [rad] between the normals at a contact and on its ring of a radius [m].
+
+    The ring of a contact on a thin wall is on that side of it, though it may lie nearer to the other. Contacts that are
+    not `among` those asked for have infinite angles.
+    """
+    variation = torch.full_like(points[..., 0], math.inf)
+    among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
+    ring = points[:, :, None] + radius / float(shape.scale) * ring_directions(normals, points, JUDGED_POINTS)
+    walls = walls_of(shape)
+    for number, wall in enumerate(walls):
+        own = among if len(walls) == 1 else among & _owned(shape, points, number)
+        variation[own] = _wall_variation(wall, ring[own], normals[own])
+    return variation
+
+
+def _owned(shape: Shape, points: Vectors, number: int) -> Bool[Tensor, "b f"]:
+    """Tell which contacts are on one wall of a shape of several."""
+    owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009 a shape of one wall need not tell
+    return owner[:, number].unflatten(0, points.shape[:2])
+
+
+def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
+    """Return the same for points near one surface."""
+    _, gradient = shape.mean_and_gradient(project(shape, ring, steps=1).flatten(0, 1))
+    there = unit(gradient).view_as(ring)
+    here = normals[:, None].expand_as(there)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
+    return torch.atan2(sine, (here * there).sum(-1)).amax(-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class FlatnessConstraint(Batch):
+    """Values <= 0 on flat surface, linear about the points `at` of their evaluation, by their 3 f coordinates.
+
+    A ring costs as much as several steps of a solver: evaluate it rarely.
+    """
+
+    value: Float[Tensor, "b k"]
+    by_points: Float[Tensor, "b k x"]
+    at: Vectors
+
+    def values(self, points: Vectors) -> Float[Tensor, "b k"]:
+        """Return the values at points nearby."""
+        return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
+
+
+def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
+    """Evaluate |n - n_k| for the normals at a contact and on its ring, less the chord of `flatness` [rad].
+
+    Values are lengths: chords times the ring's `radius` [m], normalised.
+    """
+    found, *others = (_wall_constraint(wall, points, flatness, radius) for wall in walls_of(shape))
+    for number, other in enumerate(others, start=1):
+        own = _owned(shape, points, number)[:, None].expand(-1, GUIDING_POINTS, -1).flatten(1)
+        value, slope = (
+            torch.where(own, other.value, found.value),
+            torch.where(own[..., None], other.by_points, found.by_points),
+        )
+        found = FlatnessConstraint(value, slope, points)
+    return found
+
+
+def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
+    """Return the same of one surface."""
+    jet, radius = triple_mean_jet(shape, points), radius / float(shape.scale)
+    identity = torch.eye(3, dtype=points.dtype, device=points.device)
+    around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
+    normal, normal_jacobian = jet.normals[:, None], jet.normal_jacobian[:, None]
+    ring = points[:, None] + radius * around  # (b, k, f, 3)
+    # The ring turns with the normal at its centre.
+    ring_by_point = identity - radius * normal[..., :, None] * (around[..., None, :] @ normal_jacobian)
+    there = triple_mean_jet(shape, ring.flatten(0, 1))
+    difference = there.normals.view_as(ring) - normal
+    chord = torch.linalg.vector_norm(difference, dim=-1)
+    direction = difference / torch.where(chord == 0, 1.0, chord)[..., None]
+    change = there.normal_jacobian.view(*ring.shape, 3) @ ring_by_point - normal_jacobian
+    slope = (direction[..., None, :] @ change)[..., 0, :]
+    own = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+    by_points = torch.einsum("bkij,il->bkilj", radius * slope, own).flatten(3).flatten(1, 2)
+    value = radius * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)
+    return FlatnessConstraint(value, by_points, points)
+
 
 ON_SURFACE = 1e-6
 """Largest |f_d| of a contact on the surface, normalised: 0.1 um on a hand-sized object, far above rounding."""

@@ -25,7 +25,7 @@ from torch import Tensor
 from torchgrasp.checks import ANY, Positive, checked
 from torchgrasp.geometry.frames import skew
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
-from torchgrasp.plan.closure_lp import solve_closure_lp
+from torchgrasp.plan.closure import solve_closure_lp
 from torchgrasp.plan.problem import contact_pairs, pull_signs
 from torchgrasp.plan.wrench import Vectors, centre_and_radius, wrenches
 

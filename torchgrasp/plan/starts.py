@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.flatness import normal_variation
+from torchgrasp.plan.closure import closed_exact
+from torchgrasp.plan.feasibility import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of, walls_of
-from torchgrasp.plan.round_cones import closed_exact
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.wrench import Vectors
 from torchgrasp.specs import FLAT_RADII, ContactSpec

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
-from torchgrasp.posture_model.em import Components, Progress
-from torchgrasp.posture_model.shard import Shard
+from torchgrasp.posture_model.em import Components, Progress, Shard
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Expectation-maximisation of Gaussian mixtures (Eqs. 19-20).
+"""Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in each process that torchrun started.
 
 The data are standardised: every column has mean 0 and variance 1, or the features below would cancel. Each step is
-one matrix product over the features [1, x_i, x_i x_j]. The log-density of a Gaussian is linear in them, and their
-responsibility-weighted sums suffice for the maximisation. These sums are small enough to be added over processes.
+one matrix product over the features [1, x_i, x_i x_j]. The log-density of a Gaussian is linear in the features, and
+their sums weighted by responsibilities suffice for the maximisation. The sums are small enough to add over processes.
 """
 
 import dataclasses
@@ -10,13 +10,44 @@ import math
 from collections.abc import Callable
 
 import torch
+import torch.distributed
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.posture_model.gaussian import whitening_matrices
-from torchgrasp.posture_model.shard import Shard
+
+
+@dataclasses.dataclass(frozen=True)
+class Shard:
+    """The rows of one process. Several processes form the default group of torch.distributed."""
+
+    rows: Float[Tensor, "n d"]
+    rank: int = 0
+    processes: int = 1
+
+    @staticmethod
+    def of(rows: Float[Tensor, "n d"], distributed: bool) -> "Shard":
+        """Return the shard of this process; raises `BadArgument` for a distributed one without a group."""
+        if not distributed:
+            return Shard(rows)
+        if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
+            allowed = "True after torch.distributed.init_process_group, as under torchrun"
+            raise BadArgument("distributed", "True in a process without a group", allowed)
+        return Shard(rows, torch.distributed.get_rank(), torch.distributed.get_world_size())
+
+    def sum(self, x: Tensor) -> Tensor:
+        """Return the sum of x over all processes; every process gets the same bits."""
+        if self.processes > 1:
+            x = x.clone()
+            torch.distributed.all_reduce(x)
+        return x
+
+    def count(self) -> int:
+        """Count the rows of all processes."""
+        return int(self.sum(self.rows.new_tensor(len(self.rows), dtype=torch.int64)))
+
 
 CACHED_ROWS = 2048
 """Rows of one pass: their features and responsibilities stay in the cache."""

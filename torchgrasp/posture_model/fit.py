@@ -12,12 +12,11 @@ from torchgrasp.base import check_whole
 from torchgrasp.checks import Count, Fraction, Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.checkpoint import Checkpoint
-from torchgrasp.posture_model.em import Progress, expectation_maximisation
+from torchgrasp.posture_model.em import Progress, Shard, expectation_maximisation
 from torchgrasp.posture_model.encoding import CODE_NAMES
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
-from torchgrasp.posture_model.shard import Shard
 
 MAX_REGULARISATION = 1e-6
 """Largest variance added to a dimension, relative to the data's: scikit-learn's default, which is absolute there."""

@@ -7,8 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model.em import CACHED_ROWS, Progress, features_from_data, maximisation
-from torchgrasp.posture_model.shard import Shard
+from torchgrasp.posture_model.em import CACHED_ROWS, Progress, Shard, features_from_data, maximisation
 
 SUBSAMPLE = 20_000
 """Rows among which k-means++ chooses its centres: some hundred for each component."""

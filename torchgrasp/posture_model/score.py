@@ -1,12 +1,17 @@
-"""Errors of a learned model on held-out postures (Sec. 6.3)."""
+"""How good a learned model is: errors on held-out postures (Sec. 6.3), and the criterion for its size (Fig. 6)."""
 
 import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument
+from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 
@@ -71,7 +76,8 @@ def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScor
     """Evaluate a model on at least two held-out postures of its joints.
 
     >>> from torchgrasp.hand.load import load_hand
-    >>> from torchgrasp.posture_model.mixture import load_mixture
+    >>> from torchgrasp.posture_model.fit import fit_mixture
+    from torchgrasp.posture_model.mixture import load_mixture
     >>> from torchgrasp.posture_model.sample import sample_configurations
     >>> samples = sample_configurations(load_hand("barrett"), 500, seed=9, sampling="grasping")
     >>> evaluate_mixture(load_mixture("barrett"), samples).mean_error < 0.22
@@ -95,3 +101,57 @@ def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScor
         log_likelihood=float(mixture.log_prob(samples.rows().double()).mean()),
         postures=len(samples),
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class BicCurve(Value):
+    """The criterion for each number of components; less is better."""
+
+    components: Int[Tensor, "k"]
+    bic: Float[Tensor, "k"]
+
+    def __str__(self) -> str:
+        """Return the curve as a table, with its minimum."""
+        rows = [f"  {m:3d} {b:14.0f}" for m, b in zip(self.components.tolist(), self.bic.tolist(), strict=True)]
+        least = int(self.components[self.bic.argmin()])
+        end = ", the largest asked for: no minimum is seen" if least == int(self.components.max()) else ""
+        return "\n".join(["    m            BIC", *rows, f"least at {least}{end}"])
+
+
+def bic_curve(
+    samples: HandSamples,
+    components: Sequence[int] = tuple(range(5, 61)),
+    *,
+    checkpoints: Path | str | None = None,
+    observer: Callable[[int, GraspMixture], None] = lambda m, mixture: None,
+    **fit: Any,
+) -> BicCurve:
+    """Fit a mixture for each number of components and return their criterion (Fig. 6 b, d).
+
+    Codes of the middles of pads are exact functions of the joints: the criterion then falls for ever. Where tips roll,
+    it flattens and has a minimum.
+
+    Args:
+        samples: postures to fit.
+        components: numbers to try.
+        checkpoints: folder of the fits' checkpoints; a killed sweep continues from them.
+        observer: called after each fit with its number of components and its mixture.
+        fit: seed, iterations, tolerance and regularisation of `fit_mixture`.
+
+    Raises:
+        BadArgument: no number to try, or what `fit_mixture` refuses.
+        IndefiniteCovariance, ModelFileError, OutputError: as `fit_mixture`.
+
+    >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
+    >>> bic_curve(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), (1, 2)).bic.shape
+    torch.Size([2])
+    """
+    if not components:
+        raise BadArgument("components", "none", "at least one number")
+    criterion = []
+    for m in components:
+        checkpoint = None if checkpoints is None else Path(checkpoints) / f"em_{m}.safetensors"
+        mixture = fit_mixture(samples, m, checkpoint=checkpoint, **fit)
+        criterion.append(float(mixture.meta["bic"]))
+        observer(m, mixture)
+    return BicCurve(torch.tensor(list(components)), torch.tensor(criterion, dtype=torch.float64))

@@ -29,9 +29,8 @@ from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import refine
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
-from torchgrasp.posture_model.em import expectation, maximisation
+from torchgrasp.posture_model.em import Shard, expectation, maximisation
 from torchgrasp.posture_model.kmeans import start_components
-from torchgrasp.posture_model.shard import Shard
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.shape.values import Normalisation, on_surface

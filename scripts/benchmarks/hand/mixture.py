@@ -20,14 +20,13 @@ from benchmarks.hand.query import touched
 from benchmarks.hand.reach import planned_postures
 from torchgrasp import load_hand, load_mixture
 from torchgrasp.ik.seeds import query_mixture
-from torchgrasp.posture_model.em import Progress, expectation, expectation_maximisation, maximisation
+from torchgrasp.posture_model.em import Progress, Shard, expectation, expectation_maximisation, maximisation
 from torchgrasp.posture_model.encoding import encode_fingertips
 from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.kmeans import start_components
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
 from torchgrasp.posture_model.sample import HandSamples, Sampling, sample_configurations
 from torchgrasp.posture_model.score import MixtureScore, evaluate_mixture
-from torchgrasp.posture_model.shard import Shard
 
 COMPONENTS = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians."""

@@ -16,8 +16,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.posture_model.encoding import encode_fingertips
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
-from torchgrasp.posture_model.sample import HandSamples, sample_configurations
-from torchgrasp.posture_model.touch import can_close
+from torchgrasp.posture_model.sample import HandSamples, can_close, sample_configurations
 
 HANDS = ("allegro", "barrett")
 """Hands whose acceptance is measured."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
 from benchmarks.shape.accuracy import RESOLUTION, SURE_VARIANCE
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.plan.closure import closed_exact
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 

@@ -21,8 +21,8 @@ from torchgrasp.data import read_family, read_group
 from torchgrasp.evaluation.calibration import BINS, judge
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.files import format_columns
-from torchgrasp.plan.line_posterior import well_inside
-from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.plan.closure import closed_exact
+from torchgrasp.plan.closure_probability import well_inside
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import Contacts

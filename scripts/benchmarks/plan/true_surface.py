@@ -9,7 +9,7 @@ from tqdm import tqdm
 from benchmarks.common import Row
 from benchmarks.ground_truth import nearest_on_mesh
 from torchgrasp import ContactSpec, Status, fit_shape, plan_contacts
-from torchgrasp.plan.round_cones import closed_exact
+from torchgrasp.plan.closure import closed_exact
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import Contacts
 

@@ -11,7 +11,7 @@ from benchmarks.common import Row, least_seconds
 from benchmarks.proof.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify, solve_by_highs
-from torchgrasp.plan.closure_lp import solve_closure_lp
+from torchgrasp.plan.closure import solve_closure_lp
 from torchgrasp.plan.wrench import MIN_MARGIN, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts

@@ -17,7 +17,7 @@ from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.problem import finger_sets
-from torchgrasp.posture_model.touch import can_close
+from torchgrasp.posture_model.sample import can_close
 from torchgrasp.testing import check_hand
 from torchgrasp.testing.hands import find_faults, most_met, random_joints
 

@@ -17,8 +17,7 @@ from torchgrasp.posture_model.dataset import write_samples
 from torchgrasp.posture_model.fit import Progress, fit_mixture
 from torchgrasp.posture_model.mixture import GraspMixture, mixture_path
 from torchgrasp.posture_model.sample import SampleSpec, Sampling, sample_configurations
-from torchgrasp.posture_model.score import evaluate_mixture
-from torchgrasp.posture_model.selection import bic_curve
+from torchgrasp.posture_model.score import bic_curve, evaluate_mixture
 from torchgrasp.testing import check_hand
 
 STARTS = 5

@@ -20,7 +20,7 @@ from torchgrasp.checks import LEAST, Positive, Range, checked
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.hand import Hand
-from torchgrasp.posture_model.compatibility import check_compatible
+from torchgrasp.posture_model.encoding import check_compatible
 from torchgrasp.posture_model.gaussian import GaussianMixture
 
 STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "logL3"), ("logF1", "logF2", "logF3")

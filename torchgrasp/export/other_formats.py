@@ -1,4 +1,7 @@
-"""Grasps as files of published benchmarks and data sets: DexGraspBench's evaluator reads them, and GraspGen's loader.
+"""Files for other programs: grasps for DexGraspBench's evaluator and GraspGen's loader, and the surface as a mesh.
+
+DexGraspBench reads each grasp by `np.load(file, allow_pickle=True).item()`. The format exists only as a pickle, and
+`save_dexgraspbench` is the one function of torchgrasp that writes one. No function of torchgrasp reads a pickle.
 
 Facts: https://github.com/JYChen18/DexGraspBench (README and src/util/hand_util.py) and
 https://github.com/NVlabs/GraspGen (docs/GRASP_DATASET_FORMAT.md).
@@ -13,9 +16,10 @@ import torch
 from torchgrasp.checks import Positive, Range, checked
 from torchgrasp.control.forces import squeeze
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.export.grasp_json import quaternion
+from torchgrasp.export.postures import quaternion
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.hand import Hand
+from torchgrasp.shape.surface import Surface
 from torchgrasp.values import Grasps
 
 BENCH_HANDS = {"allegro": ([0.0, 1.0, 0.0, 1.0], [f"joint_{k}" for k in range(16)])}
@@ -111,3 +115,65 @@ def rotation_of(wxyz: list[float]) -> torch.Tensor:
 
     w, x, y, z = wxyz
     return torch.tensor(Rotation.from_quat([x, y, z, w]).as_matrix())
+
+
+@checked
+def save_surface(surface: Surface, path: Path | str) -> Path:
+    """Write a surface as `.ply`, with `std_m` [m] of each vertex, or `.glb`. Yellow marks `largest_std`, violet 0.
+
+    Raises:
+        BadArgument: another suffix.
+        OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import fit_shape, load_object
+    >>> from torchgrasp.shape import extract_surface
+    >>> surface = extract_surface(fit_shape(load_object("jug").view), 24)
+    >>> save_surface(surface, Path(tempfile.mkdtemp(), "jug.ply")).stat().st_size > 10_000
+    True
+    """
+    import matplotlib
+    import trimesh
+
+    path = check_surface_path(path)
+    std = surface.std_m.detach().cpu().double().numpy()
+    shares = np.clip(std / largest_std(surface), 0.0, 1.0)
+    colors = (255 * matplotlib.colormaps["viridis"](shares) + 0.5).astype(np.uint8)  # as in the report
+    mesh = trimesh.Trimesh(
+        vertices=surface.vertices.detach().cpu().double().numpy(),
+        faces=surface.faces.cpu().numpy(),
+        vertex_normals=surface.normals.detach().cpu().double().numpy(),
+        vertex_colors=colors,
+        process=False,
+    )
+    if path.suffix.lower() == ".ply":
+        mesh.vertex_attributes["std_m"] = std.astype(np.float32)
+    content = mesh.export(file_type=path.suffix.lower()[1:])
+    assert isinstance(content, bytes)
+    return write_file(path, content)
+
+
+@checked
+def largest_std(surface: Surface) -> float:
+    """Return the upper end [m] of the colour scale: the 99 % quantile over the vertices, at least 1 um.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> from torchgrasp.shape import extract_surface
+    >>> surface = extract_surface(fit_shape(load_object("jug").view), 24)
+    >>> 0.001 < largest_std(surface) < 0.05
+    True
+    """
+    return max(float(surface.std_m.double().quantile(0.99)), 1e-6)
+
+
+@checked
+def check_surface_path(path: Path | str) -> Path:
+    """Return the path if `save_surface` can write its format; raise `BadArgument` for another suffix.
+
+    >>> check_surface_path("a.glb").suffix
+    '.glb'
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".ply", ".glb"):
+        raise BadArgument("path", path, "a file ending in .ply or .glb")
+    return path
