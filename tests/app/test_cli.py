@@ -16,6 +16,7 @@ from torchgrasp.app.cli.inputs import check_folder
 from torchgrasp.data.shipped import DATA
 from torchgrasp.errors import MissingExtra
 from torchgrasp.evaluation.score import ViewScore
+from torchgrasp.values import load_grasps
 
 VIEW = str(DATA / "cylinder" / "view.ply")
 MESH = str(DATA / "cylinder" / "mesh.ply")
@@ -70,39 +71,11 @@ def bad_inputs(folder):
     }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "missing cloud",
-        "empty text",
-        "empty ply",
-        "other suffix",
-        "two points",
-        "millimetres",
-        "nan",
-        "unknown hand",
-        "open mesh",
-        "missing mesh",
-        "close without mesh",
-        "two tables",
-        "no friction",
-        "nan friction",
-        "no starts",
-        "negative seed",
-        "nan viewpoint",
-    ],
-)
-def test_bad_input_ends_in_one_sentence_and_leaves_nothing(name, tmp_path, capsys, refuse_work):
-    arguments, words = bad_inputs(tmp_path)[name]
-    out = tmp_path / "made" / "out"
-    assert cli.main(["grasp", *map(str, arguments), "--out", str(out)]) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith("torchgrasp: ") and said.err.count("\n") == 1 and "Traceback" not in said.err
-    assert "expected" in said.err and ", got " in said.err
-    for word in words:
-        assert word in said.err
-    assert not (tmp_path / "made").exists()
+def test_grasp_refuses_bad_input_in_one_sentence_and_leaves_nothing(tmp_path, refusal, refuse_work):
+    for name, (arguments, words) in bad_inputs(tmp_path).items():
+        error = refusal("grasp", *arguments, "--out", tmp_path / "made" / "out")
+        assert all(word in error for word in words), (name, error)
+        assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.parametrize("name", ["a" * 300, "a/" * 3000, "a\0b", "\ud800"])
@@ -116,22 +89,18 @@ def test_bad_input_ends_in_one_sentence_and_leaves_nothing(name, tmp_path, capsy
         ("--objects", ["evaluate", "--objects", "NAME", "--hand", "barrett", "--out", "out"]),
     ],
 )
-def test_what_no_file_can_be_called_is_refused_by_the_option(
-    name, option, words, tmp_path, monkeypatch, capsys, refuse_work
+def test_a_path_that_no_file_can_have_is_refused_by_its_option(
+    name, option, words, tmp_path, monkeypatch, refusal, refuse_work
 ):
     monkeypatch.chdir(tmp_path)
-    assert cli.main([name if word == "NAME" else word for word in words]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"torchgrasp: {option}: expected") and said.count("\n") == 1 and len(said) < 300
-    assert list(tmp_path.iterdir()) == []
+    error = refusal(*(name if word == "NAME" else word for word in words))
+    assert error.startswith(f"{option}: ") and len(error) < 300 and list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("out", ["file", "file/deeper", "/proc/nothing/here"])
-def test_a_folder_that_cannot_be_written_is_refused_before_the_work(out, tmp_path, capsys, refuse_work):
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(out, tmp_path, refusal, refuse_work):
     (tmp_path / "file").write_text("x")
-    assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / out)]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("torchgrasp: --out: expected") and said.count("\n") == 1
+    assert refusal("grasp", VIEW, "--out", tmp_path / out).startswith("--out: ")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
@@ -145,43 +114,33 @@ def test_check_folder_leaves_a_folder_as_it_was(tmp_path):
 
 
 @pytest.mark.promise("F9")
-def test_a_missing_simulator_is_named_before_the_work(tmp_path, capsys, monkeypatch, refuse_work):
-    monkeypatch.setattr(inputs.importlib.util, "find_spec", lambda name: None)
-    arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]
-    assert cli.main(["grasp", *arguments]) == 2
-    assert capsys.readouterr().err == f"torchgrasp: {MissingExtra('sapien', 'sim')}\n"
-
-
-def test_a_simulator_without_its_libraries_is_named_before_the_work(tmp_path, capsys, monkeypatch, refuse_work):
+@pytest.mark.parametrize("missing", ["sapien", "libX11.so.6: cannot open shared object file"])
+def test_a_missing_simulator_is_named_before_the_work(missing, tmp_path, run_command, monkeypatch, refuse_work):
     def fail(name):
-        raise ImportError("libX11.so.6: cannot open shared object file")
+        raise ImportError(missing)
 
-    monkeypatch.setattr(inputs.importlib.util, "find_spec", lambda name: "found")
+    monkeypatch.setattr(inputs.importlib.util, "find_spec", lambda name: None if missing == "sapien" else "found")
     monkeypatch.setattr(inputs.importlib, "import_module", fail)
-    arguments = [VIEW, "--hand", "allegro", "--mesh", MESH, "--close", "--out", str(tmp_path / "out")]
-    assert cli.main(["grasp", *arguments]) == 2
-    said = capsys.readouterr().err
-    assert "libX11" in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
+    code, _, error = run_command("grasp", VIEW, "--mesh", MESH, "--close", "--out", tmp_path / "out")
+    assert code == 2 and missing in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
-def test_an_error_during_the_work_is_one_sentence_too(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (MissingExtra("a package\nwith two lines", "sim"), 2, "torchgrasp: a package with two lines is not installed"),
+        (KeyboardInterrupt(), 130, "torchgrasp: interrupted\n"),
+    ],
+)
+def test_an_error_during_the_work_is_one_sentence_and_leaves_nothing(
+    error, code, said, tmp_path, run_command, monkeypatch
+):
     def fail(*args, **kwargs):
-        raise MissingExtra("a package\nwith two lines", "sim")
+        raise error
 
     monkeypatch.setattr(grasps, "plan_grasps", fail)
-    assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_interrupt_ends_with_130_and_without_files(tmp_path, capsys, monkeypatch):
-    def interrupt(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(grasps, "plan_grasps", interrupt)
-    assert cli.main(["grasp", VIEW, "--hand", "allegro", "--out", str(tmp_path / "out")]) == 130
-    assert capsys.readouterr().err == "torchgrasp: interrupted\n"
-    assert not (tmp_path / "out").exists()
+    found, _, err = run_command("grasp", VIEW, "--hand", "allegro", "--out", tmp_path / "out")
+    assert found == code and err.startswith(said) and err.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
 def test_objects_lists_files_that_exist(capsys):
@@ -220,50 +179,47 @@ def test_a_shipped_mesh_comes_with_its_parts_wherever_it_lies(tmp_path):
     assert grasps.read_true_mesh(tmp_path / "box.stl")[1] is None
 
 
-def test_grasp_from_cloud_to_files(tmp_path, capsys):
-    out = tmp_path / "out"
-    code = cli.main(["grasp", VIEW, "--hand", "barrett", "--out", str(out), "--starts", "60"])
-    said = capsys.readouterr()
-    assert said.err == ""  # no bar where there is no terminal
+def test_grasp_writes_grasps_and_pages_for_a_shipped_object_by_name(tmp_path, run_command, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run_command("grasp", "cylinder", "--hand", "barrett", "--starts", "60")
+    assert err == ""  # no bar where there is no terminal
     for stage in ("cloud", "shape", "plan", "certify", "query", "refine", "report"):
-        assert any(line.startswith(stage) for line in said.out.splitlines())
-    assert sorted(p.name for p in out.iterdir()) == ["grasps.safetensors", "report.html", "view.html"]
-    assert 'href="view.html"' in (out / "report.html").read_text()
-
-    from torchgrasp.values import load_grasps
-
-    found = load_grasps(out / "grasps.safetensors")
+        assert any(line.startswith(stage) for line in out.splitlines())
+    folder = tmp_path / "out" / "cylinder"
+    assert sorted(p.name for p in folder.iterdir()) == ["grasps.safetensors", "report.html", "view.html"]
+    assert 'href="view.html"' in (folder / "report.html").read_text()
+    found = load_grasps(folder / "grasps.safetensors")
     assert found.meta["hand"] == "barrett" and found.meta["seed"] == "0" and "metre" in found.meta["units"]
-    assert code == (0 if bool((found.status == 0).any()) else 1)
-    assert torch.isfinite(found.joints).all()
-    assert said.out.splitlines()[-1].startswith("The barrett hand has")
+    assert code == (0 if bool((found.status == 0).any()) else 1) and torch.isfinite(found.joints).all()
+    assert out.splitlines()[-1].startswith("The barrett hand has")
 
 
-def test_an_empty_result_names_what_would_help(tmp_path, capsys):
-    code = cli.main(
-        [
-            "grasp",
-            VIEW,
-            "--hand",
-            "barrett",
-            "--out",
-            str(tmp_path),
-            "--starts",
-            "10",
-            "--friction",
-            "0",
-            "--table",
-            "0",
-            "--no-report",
-        ]
-    )
-    said = capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("words", "near"),
+    [
+        (["gras", "x"], "grasp"),
+        (["grasp", "jgu"], "jug"),
+        (["grasp", "jug", "--hand", "alegro"], "allegro"),
+    ],
+)
+def test_a_misspelt_name_is_answered_with_the_nearest_one(words, near, tmp_path, monkeypatch, refusal, refuse_work):
+    monkeypatch.chdir(tmp_path)
+    assert refusal(*words).endswith(f"; did you mean {near}?\n")
+
+
+def test_help_lists_every_command_in_a_chapter(run_command):
+    code, out, _ = run_command("--help")
+    assert code == 0 and all(f"\n  {name} " in out for name in cli.COMMANDS) and "Plan grasps" in out
+
+
+def test_an_empty_result_names_what_would_help(tmp_path, run_command):
+    options = ["--starts", "10", "--friction", "0", "--table", "0", "--no-report"]
+    code, out, _ = run_command("grasp", VIEW, "--hand", "barrett", "--out", tmp_path, *options)
     assert code == 1 and [p.name for p in tmp_path.iterdir()] == ["grasps.safetensors"]
-    assert any(line.startswith("change") and "executable" in line for line in said.splitlines())
-    last = said.splitlines()[-1]
-    assert (
-        last.startswith("The barrett hand has no executable grasp") and "if the friction were 0.4 instead of 0" in last
-    )
+    assert any(line.startswith("change") and "executable" in line for line in out.splitlines())
+    last = out.splitlines()[-1]
+    assert last.startswith("The barrett hand has no executable grasp")
+    assert "if the friction were 0.4 instead of 0" in last
 
 
 @pytest.mark.parametrize("words", [["cloud"], ["cloud", "--help"], ["shape", "-h"], ["cloud", "check", "--help"]])
@@ -341,48 +297,43 @@ def test_the_shell_completes_commands_of_a_group(typed, offered, tmp_path, capsy
     assert set(done.stdout.split()) - {"--help", "-h"} == offered
 
 
-def test_cloud_check_reports_a_view(capsys):
-    assert cli.main(["cloud", "check", VIEW]) == 0
-    said = capsys.readouterr().out
+def test_cloud_check_reports_a_view(run_command):
+    code, out, _ = run_command("cloud", "check", VIEW)
+    assert code == 0
     for word in ("points      1000", "mm", "spacing", "noise", "outliers", "normals", "viewpoint   given"):
-        assert word in said
+        assert word in out
 
 
-def test_cloud_check_names_what_to_mend(tmp_path, capsys):
+def test_cloud_check_names_fixes(tmp_path, run_command):
     points = sphere(6000)
     points[:3] += 0.3
     np.save(tmp_path / "ball.npy", np.concatenate([points, points[:5]]))
-    assert cli.main(["cloud", "check", str(tmp_path / "ball.npy")]) == 1  # no camera sees a ball from all sides
-    said = capsys.readouterr().out
-    assert "6005 (5 of them copies)" in said and "torchgrasp cloud thin" in said
-    assert next(line for line in said.splitlines() if line.startswith("outliers")).split()[1] == "3"
+    code, out, _ = run_command("cloud", "check", tmp_path / "ball.npy")
+    assert code == 1 and "6005 (5 of them copies)" in out and "torchgrasp cloud thin" in out  # no camera sees all sides
+    assert next(line for line in out.splitlines() if line.startswith("outliers")).split()[1] == "3"
 
 
-@pytest.mark.parametrize("name", ["missing cloud", "empty ply", "other suffix", "two points", "millimetres", "nan"])
-def test_cloud_check_refuses_by_name(name, tmp_path, capsys):
-    path = bad_inputs(tmp_path)[name][0][0]
-    assert cli.main(["cloud", "check", str(path)]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith("torchgrasp: FILE: expected") and said.err.count("\n") == 1
+def test_cloud_check_refuses_by_name(tmp_path, refusal):
+    inputs = bad_inputs(tmp_path)
+    for name in ("missing cloud", "empty ply", "other suffix", "two points", "millimetres", "nan"):
+        assert refusal("cloud", "check", inputs[name][0][0]).startswith("FILE: ")
 
 
-def test_cloud_render_writes_what_cloud_check_and_shape_surface_read(tmp_path, capsys):
+def test_cloud_render_writes_a_cloud_that_cloud_check_and_shape_surface_read(tmp_path, run_command):
     out = tmp_path / "made" / "view.ply"
-    arguments = ["--azimuth", "200", "--elevation", "20", "--points", "300", "--seed", "4"]
-    assert cli.main(["cloud", "render", MESH, "--out", str(out), *arguments]) == 0
+    words = ["cloud", "render", MESH, "--out", out, "--azimuth", "200", "--elevation", "20", "--points", "300"]
+    assert run_command(*words)[0] == 0
     first = out.read_bytes()
-    assert cli.main(["cloud", "render", MESH, "--out", str(out), *arguments]) == 0
-    assert out.read_bytes() == first
-    assert cli.main(["cloud", "check", str(out)]) == 0
-    assert "300" in capsys.readouterr().out
+    assert run_command(*words)[0] == 0 and out.read_bytes() == first
+    assert "300" in run_command("cloud", "check", out)[1]
     for suffix in ("ply", "glb"):
         surface = tmp_path / f"surface.{suffix}"
-        assert cli.main(["shape", "surface", str(out), "--out", str(surface), "--resolution", "24"]) == 0
+        code, said, _ = run_command("shape", "surface", out, "--out", surface, "--resolution", "24")
+        assert code == 0 and "mm where it is yellow" in said
         mesh = trimesh.load(surface, force="mesh", process=False)
         height = np.ptp(mesh.vertices, axis=0).max()
         assert 0.7 < height / np.ptp(trimesh.load(MESH, force="mesh").vertices, axis=0).max() < 1.4
         assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 20
-    assert "mm where it is yellow" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -401,9 +352,6 @@ def test_cloud_render_writes_what_cloud_check_and_shape_surface_read(tmp_path, c
         (["shape", "surface", VIEW, "--out", "a.ply", "--resolution", "4"], "--resolution: expected .*got 4"),
     ],
 )
-def test_bad_options_are_named_and_nothing_is_left(words, start, tmp_path, capsys, monkeypatch):
+def test_bad_options_are_named_and_nothing_is_left(words, start, tmp_path, refusal, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert cli.main(words) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and re.match(f"torchgrasp: {start}", said.err) and said.err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
+    assert re.match(start, refusal(*words)) and list(tmp_path.iterdir()) == []

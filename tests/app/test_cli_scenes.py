@@ -5,7 +5,6 @@ import pytest
 import trimesh
 
 from torchgrasp import Status, load_grasps
-from torchgrasp.app.cli import main
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.planner import ScenePlan, ThingPlan
 
@@ -31,16 +30,14 @@ def seen():
 
 
 @pytest.fixture
-def grasp(tmp_path, capsys):
+def grasp(tmp_path, run_command):
     """Return a function that writes a scene, runs the command and returns its exit code and words."""
 
     def run(arrays: dict[str, np.ndarray], *options: str) -> tuple[int, str]:
         np.savez(tmp_path / "scene.npz", **arrays)
-        code = main(
-            ["grasp", str(tmp_path / "scene.npz"), "--hand", "barrett", "--out", str(tmp_path / "out"), *options]
-        )
-        said = capsys.readouterr()
-        return code, said.err if code == 2 else said.out
+        words = ["grasp", tmp_path / "scene.npz", "--hand", "barrett", "--out", tmp_path / "out", *options]
+        code, out, err = run_command(*words)
+        return code, err if code == 2 else out
 
     return run
 
@@ -112,14 +109,12 @@ def test_a_bad_scene_is_refused_in_one_sentence(seen, grasp, case):
     assert word in words and len(words.strip().splitlines()) == 1
 
 
-def test_a_label_needs_a_scene(grasp, tmp_path, capsys):
+def test_a_label_needs_a_scene(tmp_path, refusal):
     np.save(tmp_path / "cloud.npy", np.random.default_rng(0).random((50, 3)))
-    code = main(["grasp", str(tmp_path / "cloud.npy"), "--hand", "barrett", "--out", str(tmp_path), "--label", "1"])
-    assert code == 2 and "--label" in capsys.readouterr().err
+    assert "--label" in refusal("grasp", tmp_path / "cloud.npy", "--out", tmp_path, "--label", "1")
 
 
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"not a zip"])
-def test_a_broken_scene_file_is_refused(tmp_path, capsys, data):
+def test_a_broken_scene_file_is_refused(tmp_path, refusal, data):
     (tmp_path / "scene.npz").write_bytes(data)
-    code = main(["grasp", str(tmp_path / "scene.npz"), "--hand", "barrett", "--out", str(tmp_path / "out")])
-    assert code == 2 and len(capsys.readouterr().err.strip().splitlines()) == 1
+    refusal("grasp", tmp_path / "scene.npz", "--out", tmp_path / "out")
