@@ -89,9 +89,7 @@ class CloudCut(Command):
         None,
         "a point on or near the object; points farther than 0.5 m away are left out. By default the largest",
     )
-    box: tuple[float, float, float, float, float, float] | None = option(
-        None, "two corners of a box; points outside are left out first"
-    )
+    box: tuple[float, float, float, float, float, float] | None = option(None, "two corners of a box to cut first")
     gap: float = option(0.02, "least distance between two objects [m]")
 
     def run(self) -> int:
@@ -242,7 +240,7 @@ class ShapeSurface(Command):
     out: Path = required('mesh to write: .ply, with the standard deviation of each vertex as "std_m" [m], or .glb')
     view: CloudOptions = nested(CloudOptions())
     support: Literal["camera", "paper"] = option(
-        "camera", "observations of the hidden side: outline, symmetry and free space, or the paper's points"
+        "camera", "observations of the hidden side: from the camera, or the paper's points"
     )
     resolution: int = option(64, "cells along the diameter of the surface's domain, 8 to 256")
     seed: Seed = option(0, SEED_HELP)

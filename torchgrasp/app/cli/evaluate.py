@@ -61,9 +61,7 @@ class Evaluate(_Trials):
     fingers: str = option("default", f'{FINGERS_HELP}; "auto" takes for each view the most likely option to succeed')
     protocol: Protocol = option("dexgraspbench", PROTOCOL_HELP)
     holding: HoldingMode = option("force", "how the hand presses after closing")
-    force: float | None = option(
-        None, "normal force of the strongest finger [N]; by default 7 before a pull, 4 before a lift, 6 for household"
-    )
+    force: float | None = option(None, "normal force of the strongest finger [N]; by default as the protocol says")
     complete: bool = option(False, "plan on the whole cloud instead of each view")
     planned: Path | None = option(None, 'folder "grasps" of an earlier run, whose grasps are tested')
     workers: int = option(1, "processes; the results do not depend on their number")
@@ -160,11 +158,9 @@ class Campaign(_Trials):
     licence: str = option("unknown", "licence of the data set, for its card, as CC-BY-4.0")
     jobs_in_shard: int = option(64, "number of jobs whose records share a file")
     workers: Annotated[int, Range(0, 1024)] = option(
-        1, "processes on this machine, 0: this process; the data do not depend on their number"
+        1, "processes here, 0: this one; the data do not depend on their number"
     )
-    scheduler: str | None = option(
-        None, "address of a Dask scheduler, as tcp://10.0.0.1:8786, whose workers do the jobs instead"
-    )
+    scheduler: str | None = option(None, "Dask scheduler, as tcp://10.0.0.1:8786, whose workers do the jobs instead")
 
     def run(self) -> int:
         """Run the campaign and print its counts."""

@@ -52,9 +52,7 @@ class Export(Command):
         None,
         "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's",
     )
-    object: str | None = option(
-        None, "for dexgraspbench, its folder of the object; for graspgen, the mesh of the object in its data set"
-    )
+    object: str | None = option(None, "dexgraspbench: its folder of the object; graspgen: the mesh in its data set")
 
     def run(self) -> int:
         """Write the grasps."""

@@ -80,9 +80,7 @@ class HandSample(Command):
     out: Path = required("folder to write")
     n: int = option(1_000_000, "number of postures; the paper has 1,000,000")
     fingers: str = option("default", FINGERS_HELP)
-    sampling: Sampling = option(
-        "uniform", "uniform as in the paper, or grasping: only postures that can hold an object"
-    )
+    sampling: Sampling = option("uniform", "uniform as in the paper; grasping: postures that can hold an object")
     workers: int = option(1, "threads that sample")
     seed: Seed = option(0, SEED_HELP)
 
@@ -103,9 +101,7 @@ class HandTrain(Command):
     """Learn the posture model of a hand: check, sample, fit, evaluate and write. Only the paper's modes need it."""
 
     hand: str = positional(HAND_HELP)
-    n: Annotated[int, Range(1, 10**8)] = option(
-        200_000, "postures to learn from, which can hold an object where their tips have rolled"
-    )
+    n: Annotated[int, Range(1, 10**8)] = option(200_000, "postures to learn from, all of which can hold an object")
     components: int | None = option(None, "Gaussians; by default the number with the least BIC among 5, 10, .. 60")
     seed: Seed = option(0, "random seed of postures and of the first start")
     held_out: Annotated[int, Range(2, 10**7)] = option(20_000, "further postures for the evaluation")

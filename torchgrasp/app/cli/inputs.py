@@ -50,9 +50,7 @@ class ViewOptions:
     no_viewpoint: bool = option(False, "estimate the camera's position instead of using the file's")
     no_normals: bool = option(False, "fit normals instead of using the file's")
     unit: Literal["m", "cm", "mm"] = option("m", "unit of the numbers in the file; options and results are in metres")
-    up: tuple[float, float, float] | None = option(
-        None, "vertical direction in the frame of the cloud, of any length; by default z"
-    )
+    up: tuple[float, float, float] | None = option(None, "vertical direction, of any length; by default z")
     camera_pose: Path | None = option(
         None,
         "file with frame_from_camera, 4 x 4 (.npy or .txt), for a cloud in the camera's frame (x right, y down, z "

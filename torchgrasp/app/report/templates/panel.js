@@ -1,4 +1,4 @@
-// The state of the page, and how the scene and the elements of the panel follow it.
+// The state of the page; `show` changes it and updates the scene and the panel.
 const state = { grasp: 1, posture: "grasp", sigma: 0, tick: null };
 const hidden = new Set();
 
@@ -45,7 +45,7 @@ add(sigmaRow, "span", {}, "shell");
 const sigma = add(sigmaRow, "input", { type: "range", id: "sigma", min: 0, max: 3, step: 0.1 });
 const sigmaText = add(sigmaRow, "output");
 sigma.oninput = () => show({ sigma: Number(sigma.value), tick: null });
-follow.push(() => { sigma.value = state.sigma; sigmaText.value = `${state.sigma.toFixed(1)} deviations`; });
+follow.push(() => { sigma.value = state.sigma; sigmaText.value = `${state.sigma.toFixed(1)} standard deviations`; });
 
 if (count) {
   add(panel, "h2", {}, "Posture of the hand");
@@ -132,7 +132,7 @@ if (count) {
   });
 }
 
-/* Keys do what buttons and rows do; a slider that has the focus keeps its arrows. */
+/* Keys act like buttons and rows; a slider with the focus keeps its arrow keys. */
 if (count) {
   add(panel, "p", { className: "source" }, "Keys: up and down step through the grasps, 1 to 4 choose the posture.");
   window.addEventListener("keydown", (event) => {
@@ -141,12 +141,12 @@ if (count) {
     if (posture) show({ posture, tick: null });
     if (!step) return;
     show({ grasp: Math.min(Math.max(state.grasp + step, 1), count), tick: null });
-    event.preventDefault(); // of the panel's own scrolling
+    event.preventDefault(); // the panel does not scroll
     document.querySelector("#grasps tr.on").scrollIntoView({ block: "nearest" });
   });
 }
 
-/* The part of the address after "#" names a state; what it cannot mean is told on the page. */
+/* The part of the address after "#" names a state; the page shows an error for an unknown state. */
 function read() {
   const asked = new URLSearchParams(location.hash.slice(1)), change = {};
   const most = { grasp: [1, count], sigma: [0, 3], tick: [0, replay ? replay.ticks.length - 1 : -1] };
@@ -154,7 +154,7 @@ function read() {
     const [low, high] = most[name] || [], value = Number(text);
     if (name === "posture" && run.postures.includes(text)) change.posture = text;
     else if (text !== "" && value >= low && value <= high && (name === "sigma" || Number.isInteger(value))) change[name] = value;
-    else console.error(`The address asks for ${name}=${text}, which this page does not have.`);
+    else console.error(`Unknown state in the address: ${name}=${text}`);
   }
   show({ tick: null, ...change });
 }

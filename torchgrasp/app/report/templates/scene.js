@@ -1,5 +1,5 @@
-// What is seen: layers of shapes, a camera, and how they move. The panel beside it is panel.js.
-// Errors stand on the page: a person sees them without a console, and so does a test.
+// The 3D scene: layers of shapes, a camera, and their motion. panel.js makes the panel beside it.
+// Errors are shown on the page, so that users and tests see them without a console.
 const panel = document.getElementById("panel"), stage = document.getElementById("stage");
 const errors = add(panel, "pre", { id: "errors" });
 window.onerror = (message) => { errors.textContent += message + "\n"; };
@@ -9,7 +9,7 @@ console.error = (...words) => { errors.textContent += words.join(" ") + "\n"; ow
 const run = JSON.parse(document.getElementById("data").textContent);
 const KINDS = { f4: Float32Array, u4: Uint32Array, u1: Uint8Array };
 
-/* Elements get their texts as text, never as HTML. */
+/* The text of an element is never read as HTML. */
 function add(parent, tag, values = {}, text = null) {
   const element = Object.assign(document.createElement(tag), values);
   if (text !== null) element.textContent = text;
@@ -34,7 +34,7 @@ function lit(values) {
   return new THREE.MeshPhongMaterial({ shininess: 25, specular: 0x222222, side: THREE.DoubleSide, ...values });
 }
 
-// What is seen, one group for each layer.
+// One group of shapes for each layer.
 const scene = new THREE.Scene(), layers = {};
 scene.background = new THREE.Color("#fcfcfa");
 function layer(name) {
@@ -47,7 +47,7 @@ function addCloud(name, buffer, color) {
   layer(name).add(new THREE.Points(geometry({ points: buffer }), new THREE.PointsMaterial(values)));
 }
 addCloud("cloud", run.cloud, "#c2452d");
-if (run.others) addCloud("other things", run.others, "#8b929c");
+if (run.others) addCloud("other objects", run.others, "#8b929c");
 
 const surface = geometry(run.surface), shell = geometry(run.surface);
 layer("surface").add(new THREE.Mesh(surface, lit({ vertexColors: true })));
@@ -68,7 +68,7 @@ const pieces = run.hand.map((piece) => {
   return mesh;
 });
 
-/* Matrices come row by row; `frame` counts postures of grasps, or ticks. */
+/* Matrices are stored row by row; `frame` is the index of a posture or of a tick. */
 function pose(links, shape, frame) {
   const count = shape[shape.length - 3];
   for (const mesh of pieces) place(mesh, links, frame * count + mesh.userData.link);
@@ -108,7 +108,7 @@ if (replay) {
   layer("true object").add(truth);
 }
 
-// The first look: all of the object, the table and the hand at the first grasp.
+// The first view shows the object, the table and the hand at the first grasp.
 const count = run.grasps.rows.length;
 surface.computeBoundingBox();
 const bounds = surface.boundingBox.clone();
@@ -135,10 +135,10 @@ for (const [x, y, z, strength] of [[-0.5, 0.7, 0.6, 0.5], [0.7, 0.1, 0.6, 0.25]]
 }
 let renderer = null, controls = null;
 try {
-  // Headless pictures are taken between two frames, so the last one has to be kept.
+  // Headless browsers take pictures between two frames, so the last frame is kept.
   renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
 } catch (failure) {
-  add(stage, "p", { id: "nothing" }, "This browser shows no WebGL, so nothing turns here. The report beside this page has pictures.");
+  add(stage, "p", { id: "nothing" }, "This browser has no WebGL, which the 3D view needs. The report beside this page has pictures.");
 }
 function draw() { if (renderer) renderer.render(scene, camera); }
 function home() {
