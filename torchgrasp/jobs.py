@@ -1,4 +1,4 @@
-"""Tasks on worker processes: a simulator that hangs or dies costs its own task alone."""
+"""Tasks on worker processes: a worker that hangs or dies loses only its own task."""
 
 import contextlib
 import functools
@@ -21,13 +21,6 @@ from torchgrasp.errors import MissingExtra, Status
 Result = TypeVar("Result")
 Task = tuple[Any, ...]
 
-JOIN_TIME = 10.0
-"""Longest time [s] for stopped workers to end: they are killed, which takes milliseconds."""
-AHEAD = 2
-"""Tasks of a worker that are handed over: one at which it works, and the next. Others can still be overtaken."""
-LOOK_AGAIN = 1.0
-"""Time [s] after which a pool that says nothing is asked whether it is broken: then some tasks never end in it."""
-
 
 @checked
 def run_tasks(
@@ -38,19 +31,19 @@ def run_tasks(
 ) -> Generator[Result | Status, None, None]:
     """Yield `function(*task)` for each task, in the order of the tasks.
 
-    A task runs on one thread, a worker is a fresh process. A late task gives `Status.TIMED_OUT`, a task whose process
-    dies twice `Status.WORKER_DIED`. All workers end when the caller stops listening.
+    Each task runs on one thread of a fresh process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task whose
+    process dies twice gives `Status.WORKER_DIED`. All workers end when the caller stops iterating.
 
     Args:
-        function: of a module, so that a worker can import it.
-        tasks: arguments of the calls: paths, numbers, arrays and values of them, but no tensors, which would be shared.
-        workers: processes; 0: this one, without a limit of time.
+        function: a function of a module, so that a worker can import it.
+        tasks: arguments of the calls: paths, numbers and arrays, but no tensors, because processes would share them.
+        workers: number of processes; 0: this process, without a time limit.
         limit: wall time of a task [s].
 
     Raises:
         BadArgument: workers outside [0, 1024], or a limit below 1 ms.
         MissingExtra: pebble is not installed.
-        Exception: of a task, when its turn comes.
+        Exception: the error of a task, when its turn comes.
 
     >>> list(run_tasks(pow, [(2, 3), (3, 2)], workers=0))
     [8, 9]
@@ -71,7 +64,7 @@ def run_as_they_end(
 
 
 def _run_here(function: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
-    """Yield the results of this process, which has its threads again in between."""
+    """Yield the results of this process; between tasks it has its own number of threads."""
     for task in tasks:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
@@ -85,7 +78,7 @@ def _run_here(function: Callable[..., Result], tasks: Iterable[Task]) -> Generat
 def _in_order(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[Result | Status, None, None]:
-    """Yield the results of workers in the order of the tasks; one that is early waits."""
+    """Yield the results of workers in the order of the tasks."""
     early: dict[int, Future[Result] | Status] = {}
     turn = 0
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
@@ -100,7 +93,7 @@ def _in_order(
 def _run(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Yield what comes of each task, as it ends; where all workers die before they take one, others come."""
+    """Yield the result of each task when it ends; start a new pool if all workers died before they took a task."""
     waiting, died = deque(enumerate(tasks)), set[int]()
     broken = 0
     while waiting:
@@ -115,35 +108,31 @@ def _run(
 def _run_pool(
     function: Callable[..., Result], waiting: deque[tuple[int, Task]], died: set[int], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Take tasks and yield what comes of them, until all have ended or the pool of workers is broken.
+    """Yield the results of tasks until all have ended or the pool is broken.
 
-    Args:
-        function: as in `run_tasks`.
-        waiting: number and task of each; what did not end is put back.
-        died: numbers of the tasks that died once; those that do so are added.
-        workers: processes.
-        limit: wall time of a task [s].
+    `waiting` holds the number of each task, and the task; unfinished tasks are put back. `died` holds the numbers of
+    tasks that died once.
     """
     try:
         from pebble import ProcessExpired, ProcessPool
     except ImportError as error:
         raise MissingExtra("pebble", "sim") from error
-    # The function goes along so that its module is imported before the first task's time begins to run.
+    # The initializer imports the module of the function before the time of the first task begins.
     pool = ProcessPool(workers, initializer=_begin, initargs=[function], context=multiprocessing.get_context("spawn"))
     ended = queue.SimpleQueue[int]()
     running: dict[int, tuple[Task, Future[Result]]] = {}
     try:
         while waiting or running:
-            while waiting and len(running) < AHEAD * workers:
+            while waiting and len(running) < 2 * workers:
                 number, task = waiting[0]
                 try:
                     future = pool.schedule(function, task, timeout=limit)
-                except RuntimeError:  # it broke meanwhile
+                except RuntimeError:  # the pool broke
                     return
                 running[number] = waiting.popleft()[1], future
                 future.add_done_callback(functools.partial(_tell, ended, number))
             try:
-                number = ended.get(timeout=LOOK_AGAIN)
+                number = ended.get(timeout=1.0)  # a broken pool may never end some tasks
             except queue.Empty:
                 if pool.active:
                     continue
@@ -153,7 +142,7 @@ def _run_pool(
                 return
             task, future = running.pop(number)
             if isinstance(error, ProcessExpired) and number not in died:
-                died.add(number)  # a machine short of memory kills the innocent too: once more, before all others
+                died.add(number)  # a machine short of memory may kill any process: try once more, first
                 waiting.appendleft((number, task))
             elif isinstance(error, ProcessExpired):
                 yield number, Status.WORKER_DIED
@@ -163,16 +152,16 @@ def _run_pool(
         waiting.extendleft((number, task) for number, (task, _) in sorted(running.items(), reverse=True))
         pool.stop()
         with contextlib.suppress(TimeoutError):  # a signal can leave pebble's threads waiting for each other
-            pool.join(JOIN_TIME)
+            pool.join(10.0)
 
 
 def _tell(ended: "queue.SimpleQueue[int]", number: int, _: "Future[Any]") -> None:
-    """Say which task ended."""
+    """Report which task ended."""
     ended.put(number)
 
 
 def _begin(function: Callable[..., Any]) -> None:
-    """Prepare a worker: one thread, and an end with the parent."""
+    """Prepare a worker: it has one thread and ends with its parent."""
     torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     assert parent is not None
