@@ -31,7 +31,7 @@ def run_tasks(
 ) -> Generator[Result | Status, None, None]:
     """Yield `function(*task)` for each task, in the order of the tasks.
 
-    Each task runs on one thread of a fresh process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task whose
+    Each task runs on one thread of a fresh process. A task beyond the limit gives `Status.TIMED_OUT`. A task whose
     process dies twice gives `Status.WORKER_DIED`. All workers end when the caller stops iterating.
 
     Args:

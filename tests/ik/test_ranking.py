@@ -17,7 +17,6 @@ from torchgrasp.ik.ranking import (
     finger_levers,
     load_arm,
     rank_in_group,
-    score,
     success_features,
     success_log_odds,
 )
@@ -67,13 +66,6 @@ def test_more_contacts_carry_a_load_as_the_best_three_do(generator):
     threes = torch.stack([load_arm(points[:, list(k)], center) for k in itertools.combinations(range(5), 3)])
     assert torch.equal(load_arm(points, center), threes.amin(0))
     assert bool((load_arm(points, center) <= load_arm(points[:, :4], center)).all())
-
-
-def test_central_untilted_grasps_rank_first():
-    pads, center = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    best = score(triple(), pads, center)
-    for worse in (triple(height=0.03), triple(tilt=0.5)):
-        assert float(score(worse, pads, center)) < float(best)
 
 
 @pytest.mark.parametrize("name", FEATURES)

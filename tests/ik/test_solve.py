@@ -20,9 +20,9 @@ from torchgrasp.values import Contacts
 def four_fingers():
     """The Allegro with all fingers, its postures, and contacts of other postures with their fingers mixed up."""
     hand = load_hand("allegro", 4)
-    contacts = touched_contacts(hand, sample_configurations(hand, 30, seed=5).joints)
-    order = torch.stack([torch.randperm(4, generator=torch.Generator().manual_seed(k)) for k in range(30)])
-    at = torch.arange(30)[:, None]
+    contacts = touched_contacts(hand, sample_configurations(hand, 12, seed=5).joints)
+    order = torch.stack([torch.randperm(4, generator=torch.Generator().manual_seed(k)) for k in range(12)])
+    at = torch.arange(12)[:, None]
     return hand, PostureLibrary.of(hand, 2000), Contacts(contacts.points[at, order], contacts.normals[at, order])
 
 
@@ -43,9 +43,9 @@ def test_contacts_of_four_fingers_are_solved_in_any_order():
 
 @pytest.fixture(scope="module", params=["allegro", "barrett"])
 def scene(request):
-    """A hand, its model, its own postures, and contacts that 40 postures of another seed touch."""
+    """A hand, its model, its own postures, and contacts that 16 postures of another seed touch."""
     hand = load_hand(request.param)
-    contacts = touched_contacts(hand, sample_configurations(hand, 40, seed=5).joints)
+    contacts = touched_contacts(hand, sample_configurations(hand, 16, seed=5).joints)
     return hand, load_mixture(request.param), PostureLibrary.of(hand), contacts
 
 
@@ -76,7 +76,7 @@ def test_the_frame_of_the_contacts_does_not_matter(scene):
     hand, mixture, library, contacts = scene
     turn = rotation_from_vector(torch.tensor([0.4, -1.0, 2.0], dtype=torch.float64))
     move = rigid(turn, torch.tensor([0.5, -0.2, 0.1], dtype=torch.float64))
-    some = contacts[:10]
+    some = contacts[:6]
     moved = Contacts(apply(move, some.points), rotate(move, some.normals))
     here, there = (solve_ik(hand, x, mixture, library=library) for x in (some, moved))
     torch.testing.assert_close(here.joints, there.joints, atol=1e-6, rtol=0)
@@ -100,7 +100,7 @@ def test_cobyla_moves_pose_and_joints_until_the_contact_points_meet():
 def test_a_table_is_kept_clear_of(scene):
     hand, mixture, library, contacts = scene
     height = float(contacts.points[..., 2].min()) - 0.005
-    solution = solve_ik(hand, contacts[:10], mixture, CollisionWorld(table=height), library=library)
+    solution = solve_ik(hand, contacts[:6], mixture, CollisionWorld(table=height), library=library)
     good = solution.status == Status.OK
     cover = hand.collision_spheres
     lowest = (apply(solution.obj_from_hand, hand.sphere_centres(solution.joints))[..., 2] - cover.radius).amin(1)

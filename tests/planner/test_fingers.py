@@ -38,13 +38,13 @@ ALL = ("index", "middle", "ring", "thumb")
 @pytest.fixture(scope="module")
 def grasps():
     """Grasps of the shipped cylinder with all fingers of the Allegro."""
-    return plan_grasps(load_object("cylinder").view, load_hand("allegro"), SPEC, starts=40, seed=1, fingers=4)
+    return plan_grasps(load_object("cylinder").view, load_hand("allegro"), SPEC, starts=24, seed=1, fingers=4)
 
 
 def test_four_fingers_touch_their_contacts_and_close(grasps):
     hand, good = hand_of(grasps), grasps[grasps.status == Status.OK]
     assert hand.finger_names == ALL and grasps.meta["finger_names"] == ",".join(ALL)
-    assert len(good) >= 10 and good.contacts.points.shape[1:] == (4, 3)
+    assert len(good) >= 4 and good.contacts.points.shape[1:] == (4, 3)
     assert bool((good.success > 0.5).any())
     tips = apply(good.obj_from_hand, hand.tip_centres(good.joints))
     wanted = good.contacts.points + hand.tips.radius[:, None] * good.contacts.normals
@@ -60,7 +60,7 @@ def test_four_fingers_touch_their_contacts_and_close(grasps):
 def test_a_file_keeps_the_fingers_and_the_same_seed_gives_the_same_bits(grasps, tmp_path):
     grasps.save(tmp_path / "four.safetensors")
     read = load_grasps(tmp_path / "four.safetensors")
-    again = plan_grasps(load_object("cylinder").view, load_hand("allegro", ALL), SPEC, starts=40, seed=1)
+    again = plan_grasps(load_object("cylinder").view, load_hand("allegro", ALL), SPEC, starts=24, seed=1)
     for name, value in named_tensors(grasps).items():
         assert torch.equal(named_tensors(read)[name], value) and torch.equal(named_tensors(again)[name], value)
     assert (
@@ -77,7 +77,7 @@ def test_another_hand_or_other_fingers_are_refused_by_name(grasps):
     nameless = dataclasses.replace(grasps, meta={})
     with pytest.raises(BadArgument, match="4 contacts"):
         closing_gains(nameless[0], load_hand("allegro"))
-    with pytest.raises(BadArgument, match="no name of a hand"):
+    with pytest.raises(BadArgument, match="without a hand"):
         hand_of(nameless)
     with pytest.raises(BadArgument, match="fingers"):
         hand_of(grasps, "barrett")
@@ -107,12 +107,12 @@ def test_forces_of_four_fingers_balance_in_the_exported_file(grasps):
 
 def test_auto_takes_the_set_whose_best_grasps_are_likeliest_to_succeed():
     view, hand, notes = load_object("cylinder").view, load_hand("allegro"), []
-    best = plan_grasps(view, hand, SPEC, 10, fingers="auto", observer=lambda *stage: notes.append(stage))
+    best = plan_grasps(view, hand, SPEC, 6, fingers="auto", observer=lambda *stage: notes.append(stage))
     hands = finger_sets(hand, "auto")
     assert [one.finger_names for one in hands] == [hand.finger_names, ALL, ("index", "middle", "ring")]
     told = [text for stage, text, _ in notes if stage == "fingers"]
     assert len(told) == 3 and all(", ".join(one.finger_names) in text for one, text in zip(hands, told, strict=True))
-    alone = [plan_grasps(view, one, SPEC, 10) for one in hands]
+    alone = [plan_grasps(view, one, SPEC, 6) for one in hands]
     likeliest = max(alone, key=expected_success)
     assert best.meta == likeliest.meta and torch.equal(best.joints, likeliest.joints)
     stages = [stage for stage, _, _ in notes if stage != "fingers"]

@@ -14,7 +14,6 @@ from torchgrasp.errors import BadArgument, SuspiciousScale
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.plane import Plane, move, upright_frame
 from torchgrasp.ik.ranking import FEATURES, MODEL, rank_by_success, success_features
-from torchgrasp.planner.batches import describe
 from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.planner.problem import digest
 from torchgrasp.shape.surface import extract_surface
@@ -29,7 +28,7 @@ def run(request):
     name, mode = request.param
     hand, view = load_hand(name), load_object("cylinder").view
     note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
-    grasps = plan_grasps(view, hand, SPEC, starts=150, seed=1, mode=mode, observer=note)
+    grasps = plan_grasps(view, hand, SPEC, starts=60, seed=1, mode=mode, observer=note)
     return hand, grasps, stages
 
 
@@ -113,9 +112,9 @@ def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
 def test_grasps_do_not_depend_on_the_frame_of_cloud_camera_and_table(moved_by):
     hand, view, shapes = load_hand("barrett"), load_object("cylinder").view.to(torch.float64), []
     note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731
-    here = plan_grasps(view, hand, SPEC, starts=30, observer=note)
+    here = plan_grasps(view, hand, SPEC, starts=12, observer=note)
     table = Plane.horizontal(0.0).moved(moved_by)
-    there = plan_grasps(move(view, moved_by), hand, ContactSpec(table=table), starts=30, observer=note)
+    there = plan_grasps(move(view, moved_by), hand, ContactSpec(table=table), starts=12, observer=note)
     back = named_tensors(move(there, inverse(moved_by)))
     for name, x in named_tensors(here).items():
         torch.testing.assert_close(back[name], x, rtol=0, atol=1e-9, msg=name)
@@ -145,19 +144,6 @@ def test_tips_limits_and_clearances_hold(run):
     spheres = hand.sphere_centres(good.joints)
     spheres = spheres @ good.obj_from_hand[:, :3, :3].transpose(1, 2) + good.obj_from_hand[:, None, :3, 3]
     assert float((spheres[..., 2] - hand.collision_spheres.radius).min()) >= SPEC.table
-
-
-def test_links_stay_out_of_the_true_cylinder(run):
-    """The planner saw one side; its clearance to what it believed holds on this simple truth up to millimetres."""
-    hand, grasps, _ = run
-    best = grasps[:5]
-    cover = hand.collision_spheres
-    spheres = hand.sphere_centres(best.joints)
-    spheres = spheres @ best.obj_from_hand[:, :3, :3].transpose(1, 2) + best.obj_from_hand[:, None, :3, 3]
-    radial = spheres[..., :2].norm(dim=-1) - 0.033  # the shipped cylinder: 66 mm wide, 110 mm high
-    above = spheres[..., 2] - 0.11
-    distance = torch.maximum(radial, above) - cover.radius
-    assert float(distance[:, ~cover.touching].min()) > -0.006
 
 
 def test_contacts_satisfy_the_spec(run):
@@ -232,8 +218,3 @@ def test_spread_rows_are_far_apart():
     assert 3 not in rows.tolist()
     assert int((rows >= 24).sum()) <= 1
     assert len(spread_rows(plan, 100)) == 49
-
-
-def test_describe_names_the_successes_first():
-    assert describe({}) == "none"
-    assert describe({Status.TOO_CLOSE: 3, Status.OK: 1}).startswith("1 ok")

@@ -92,7 +92,7 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is that of the contacts.
+    """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is the status of the contacts.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")

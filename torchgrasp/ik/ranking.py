@@ -33,7 +33,7 @@ FEATURES = (
 LEAST_ARM = 0.1
 """Added to the load's arm over the triangle's height, so that its logarithm is finite."""
 MODEL = Path(__file__).with_name("success.json")
-"""Weights and bias of the model, and what they were fitted on."""
+"""Weights and bias of the model, and a description of its training data."""
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
@@ -78,8 +78,8 @@ def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[
 def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
     """Return the arm of a load at `center` about the longest side of each triangle, over the triangle's height.
 
-    The object turns most easily about that side: only the third contact and torsion resist, by a lever of the height
-    and 10 mm for torsion. More contacts hold as well as the best three of them, at least.
+    The object turns most easily about this side: only the third contact resists, by a lever of the height, and torsion,
+    by a lever of 10 mm. More than three contacts count as their best three.
 
     >>> triangle = torch.tensor([[[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.02, 0.0]]])
     >>> load_arm(triangle, torch.tensor([0.0, 0.0, 0.06]))
@@ -100,8 +100,8 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
 def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
     """Return the lever [m] of each finger's joints about its contact's normal: the norm of their moment arms.
 
-    Joints of stiffness k yield by lever^2 / k under a unit force along the normal. So where the surface errs by e, the
-    force of a finger errs by k e / lever^2: one that points along its normal does not press, or throws the object.
+    Joints of stiffness k yield by lever^2 / k under a unit force along the normal. If the surface is off by e, the
+    force of the finger is off by k e / lever^2. A finger that points along its normal has no lever.
 
     >>> from torchgrasp import load_hand, load_object, plan_grasps
     >>> hand = load_hand("barrett")
@@ -124,7 +124,7 @@ def success_features(
     Args:
         hand: the hand; it follows the grasps to their device.
         shape: the posterior.
-        grasps: planned ones, on its surface.
+        grasps: planned grasps on its surface.
         center: of the object's mass, as far as known [m].
         friction: of fingertips and object.
         seed: of the surfaces that are drawn.
@@ -145,9 +145,9 @@ def success_features(
 
 
 def success_log_odds(features: Float[Tensor, "g k"], hand: str) -> Float[Tensor, "g"]:
-    """Return the log-odds of success, log p / (1 - p), of a grasp with a hand of this name where it was planned.
+    """Return the log-odds log(p / (1 - p)) of success of grasps with the hand of this name.
 
-    A hand on which the model was not fitted gets the least of those on which it was.
+    A hand without trials in the training data gets the least bias of the other hands.
 
     >>> good, bad = torch.tensor([[6.9, 0.3, -1.5, 0.0], [-1.0, 0.8, 0.3, -1.0]])
     >>> success_log_odds(torch.stack([good, bad]), "allegro").diff() < 0
@@ -159,14 +159,14 @@ def success_log_odds(features: Float[Tensor, "g k"], hand: str) -> Float[Tensor,
 
 
 def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:
-    """Return grasps scored by the log-odds of the k executable ones, these first, best first."""
+    """Return grasps scored by the log-odds of the k executable grasps, which come first, best first."""
     failed, scores = grasps.status != Status.OK, grasps.score.clone()
     scores[~failed] = log_odds.to(scores)
     return dataclasses.replace(grasps, score=scores)[lexical_order(failed.int(), -scores)]
 
 
 def rank_by_variance(grasps: Grasps) -> Grasps:
-    """Return executable grasps first, the least sum of the contacts' variances first (Sec. 6.5); scores stay.
+    """Return executable grasps first, the least sum of the contacts' variances first (Sec. 6.5); scores are unchanged.
 
     Raises:
         BadArgument: contacts without `variance`.

@@ -58,7 +58,7 @@ class PostureLibrary(Value):
         wanted = (self.hand.dof, f, 6 * f, spheres)
         found = tuple(x.shape[1] for x in (self.joints, self.centres, self.feature, self.spheres))
         if found != wanted:
-            raise BadArgument("library", f"joints, tips, features and spheres {found}", f"those of the hand, {wanted}")
+            raise BadArgument("library", f"joints, tips, features and spheres {found}", f"{wanted}, as the hand has")
 
     @classmethod
     @checked
@@ -185,7 +185,7 @@ def _describe(
 def _energies(
     wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
 ) -> Float[Tensor, "r p s"]:
-    """Return half the squared distance of features from those of the postures, infinite without a frame."""
+    """Return half the squared distances of features from the features of postures, infinite without a frame."""
     energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
     return torch.where(framed[..., None], energy, torch.inf)
 

@@ -1,4 +1,4 @@
-"""Inverse kinematics of contacts: joints and pose of a hand that touches nothing else.
+"""Inverse kinematics of given contacts: joints and pose of a hand that touches nothing else.
 
 Seeds of the learned model come first (Eqs. 21-24), then the nearest random postures.
 """
@@ -39,7 +39,8 @@ EXACT = 1e-6
 class IKSolution(Batch):
     """A configuration for each row of contacts; finger i touches contact `permutation[:, i]`.
 
-    `clearance` [m] is the links' least; `attempts` counts the refined seeds. A row without seeds holds NaN.
+    `clearance` [m] is the least clearance of the links; `attempts` counts the refined seeds. A row without seeds holds
+    NaN.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -73,12 +74,12 @@ def solve_ik(
     Args:
         contacts: b rows, a contact for each fingertip; `std_m` and `variance` are not used.
         mixture: the hand's learned model; None: only the library gives seeds.
-        world: what the links must not touch; None: only each other. All arguments follow the contacts' device.
-        method: "cobyla" is the paper's (Sec. 6.3), whose tips touch with their contact points in any direction.
-        library: the hand's random postures; None: drawn when they are needed, in about a second.
+        world: what the links must not touch; None: only each other. All arguments are moved to the contacts' device.
+        method: "cobyla" is the paper's method (Sec. 6.3): tips touch with their contact points, in any direction.
+        library: the hand's random postures; None: drawn when they are needed.
 
     Returns:
-        The best attempt for each triple. With `Status.OK` every tip is within 1 mm of its contact and inside its pad's
+        The best attempt for each row. With `Status.OK` every tip is within 1 mm of its contact and inside its pad's
         cone, and every link is clear.
 
     Raises:
@@ -100,32 +101,19 @@ def solve_ik(
     device = contacts.points.device
     hand, world = settle(hand, device), settle(CollisionWorld() if world is None else world, device)
     library = None if library is None else settle(library, device)
-    move = refine_by_cobyla if method == "cobyla" else refine_exactly
-
-    library_attempts = 8
-
-    def refine_seeds(seeds: IKSeeds) -> IKSolution:
-        parts = []
-        for part in (seeds[k : k + 512] for k in range(0, max(len(seeds), 1), 512)):  # temporaries stay in the cache
-            taken = assign(contacts, part)
-            configuration = move(hand, Configuration(part.joints, part.obj_from_hand), taken, world)
-            errors = measure_errors(hand, configuration, taken, world, rolling=method != "cobyla")
-            placed = configuration.joints, configuration.obj_from_hand, part.permutation
-            measured = errors.tip_error, errors.normal_angle, errors.clearance
-            parts.append(IKSolution(*placed, *measured, torch.ones_like(errors.status), errors.status))
-        return join(parts)
+    refine_seeds = partial(_refine_seeds, hand, contacts, world, method)
 
     def library_seeds(some: Contacts) -> IKSeeds:
-        return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, library_attempts)
+        return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, n_seeds=8)
 
     def is_exact(solution: IKSolution) -> Bool[Tensor, "k"]:
         return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= 5e-5)
 
     attempts = Attempts(~degenerate(contacts.points), is_exact)
-    attempts.add(_no_solution(hand, contacts), torch.arange(len(contacts), device=contacts.points.device))
-    sources = [(library_seeds, library_attempts)]
+    attempts.add(_no_solution(hand, contacts), torch.arange(len(contacts), device=device))
+    sources = [(library_seeds, 8)]
     if mixture is not None:
-        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=2)  # mean and mode
+        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=2)  # the mean and one component
         sources = [(learned_seeds, 4), *sources]
     for source, count in sources:
         rows = torch.nonzero(attempts.unsolved)[:, 0]
@@ -138,10 +126,26 @@ def solve_ik(
     return dataclasses.replace(solution[row.argsort()], attempts=counts)
 
 
+def _refine_seeds(hand: Hand, contacts: Contacts, world: CollisionWorld, method: Method, seeds: IKSeeds) -> IKSolution:
+    """Return the refined and measured seeds."""
+    refined, rolling = refine_exactly, True
+    if method == "cobyla":
+        refined, rolling = refine_by_cobyla, False
+    parts = []
+    for part in (seeds[k : k + 512] for k in range(0, max(len(seeds), 1), 512)):  # temporaries stay in the cache
+        taken = assign(contacts, part)
+        configuration = refined(hand, Configuration(part.joints, part.obj_from_hand), taken, world)
+        errors = measure_errors(hand, configuration, taken, world, rolling)
+        placed = configuration.joints, configuration.obj_from_hand, part.permutation
+        measured = errors.tip_error, errors.normal_angle, errors.clearance
+        parts.append(IKSolution(*placed, *measured, torch.ones_like(errors.status), errors.status))
+    return join(parts)
+
+
 def refine_exactly(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Refine until the tips are exact, giving up needless margins of clearance."""
+    """Refine with margins of clearance, then without margins if the links stay clear."""
     refined = refine(hand, configuration, contacts, world, EXACT)
     settled = refine(hand, refined, contacts, None, EXACT)
     return pick(measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined)

@@ -52,7 +52,7 @@ def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
 def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable[..., None]) -> SeededContacts:
     """Return closed contacts with seeds: at most `most` rows, far apart; in mode "paper" all, the most certain first.
 
-    `note` is told of the stages "plan", "certify" and "query".
+    `note` is called with the stages "plan", "certify" and "query".
     """
     request = problem.request
     note("plan", plan)
@@ -89,7 +89,7 @@ def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
 
 
 def find_seeds(problem: Problem, contacts: Contacts) -> IKSeeds:
-    """Return postures near contacts: random ones in mode "joint", in the other modes those of the learned model."""
+    """Return postures near contacts: random postures in mode "joint", or configurations of the learned model."""
     if problem.mixture is None:
         return nearest_postures(problem.library, contacts, problem.world, reachable=problem.reachable)
     if problem.request.mode == "paper":

@@ -98,7 +98,7 @@ def plan_grasps(
             None: all poses are reachable.
 
     Returns:
-        Grasps: the executable ones (`Status.OK`) first, best first. `explain_empty` explains an empty result.
+        Grasps: executable grasps (`Status.OK`) first, best first. `explain_empty` explains an empty result.
 
     Raises:
         BadArgument: an argument of the wrong type or range; a cloud of an object that is not of graspable size; a scene

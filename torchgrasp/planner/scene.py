@@ -95,18 +95,18 @@ def plan_scene(
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)
     >>> plan.best.success > 0.5, plan.things[-1].reason
-    (True, 'not tried: another thing is easy enough')
+    (True, 'not tried: another object is easy enough')
     """
     if not scene.things:
-        raise BadArgument("scene", "no thing on the table", "a scene with at least one thing")
-    finger_sets(hand, fingers)  # refuses unknown ones
+        raise BadArgument("scene", "no object on the table", "a scene with at least one object")
+    finger_sets(hand, fingers)  # raises for unknown fingers
     plan = functools.partial(
         plan_grasps, hand=hand, spec=spec, starts=starts, seed=seed, fingers=fingers, reachable=reachable
     )
     plans: list[ThingPlan] = []
     for label in order_by_ease(scene):
         if any(thing.success >= enough for thing in plans):
-            plans.append(ThingPlan(label, 0.0, reason="not tried: another thing is easy enough"))
+            plans.append(ThingPlan(label, 0.0, reason="not tried: another object is easy enough"))
             continue
         plans.append(_plan_thing(dataclasses.replace(scene, target=label), plan))
     return ScenePlan(tuple(sorted(plans, key=lambda thing: -thing.success)))
