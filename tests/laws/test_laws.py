@@ -7,6 +7,7 @@ import sys
 import pytest
 import torch
 
+from tests.make import ball_contacts
 from torchgrasp import (
     ContactSpec,
     PointCloud,
@@ -20,13 +21,6 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.values import Normalisation, Observations
 from torchgrasp.values import Contacts
-
-
-def triples(n: int, generator: torch.Generator) -> Contacts:
-    """Random contacts on a ball of 40 mm, normals outward: many are closed, many are not."""
-    points = torch.randn(n, 3, 3, generator=generator, dtype=torch.float64)
-    normals = points / points.norm(dim=-1, keepdim=True)
-    return Contacts(0.04 * normals, normals)
 
 
 def transformed(contacts: Contacts, motion: torch.Tensor, scale: float = 1.0) -> Contacts:
@@ -75,7 +69,7 @@ def test_a_shifted_cloud_gives_a_shifted_shape(name):
 
 @pytest.mark.promise("I5", "N5")
 def test_certificates_and_codes_ignore_frames_and_units(generator, motion):
-    contacts = triples(40, generator)
+    contacts = ball_contacts(40, generator)
     spec = ContactSpec(friction=0.8, friction_margin=1.0)
     here = certify(contacts, spec)
     assert 0 < int(here.closed.sum()) < 40
@@ -88,7 +82,7 @@ def test_certificates_and_codes_ignore_frames_and_units(generator, motion):
 
 @pytest.mark.promise("N7")
 def test_the_code_of_a_permuted_triple_is_the_permuted_set(generator):
-    contacts = triples(10, generator)
+    contacts = ball_contacts(10, generator)
     swapped = Contacts(contacts.points.flip(1), contacts.normals.flip(1))
     a, b = encode(contacts).q, encode(swapped).q
     permutations = encode(contacts).permutation.tolist()

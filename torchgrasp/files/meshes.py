@@ -1,4 +1,4 @@
-"""Triangles of mesh files of strangers: one file each, nothing packed, and nothing that a file names is opened."""
+"""Triangles of mesh files: one file each, not packed; no other file that it names is opened."""
 
 import contextlib
 import io
@@ -14,11 +14,11 @@ SUFFIXES = (".obj", ".off", ".ply", ".stl")
 """Formats whose memory is bounded by the size of the file."""
 
 _REFERENCE = re.compile(rb"/\S*")
-"""Normal and texture of a corner in an .obj; a corner of two textures would be two, and the surface open there."""
+"""Normal and texture of a corner in an .obj: a corner with two textures would become two, and open the surface."""
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Return what trimesh reads from the bytes of a file; errors are whatever its readers raise.
+    """Return the mesh that trimesh reads from the bytes of a file; its readers raise errors of any kind.
 
     Args:
         data: of the file.
@@ -40,7 +40,7 @@ def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
 
 @contextlib.contextmanager
 def _quiet(log: logging.Logger) -> Iterator[None]:
-    """Keep what readers log in this thread to themselves: else Python prints it on stderr, traceback and all."""
+    """Drop the log records of this thread: Python would print them on stderr."""
     here = threading.get_ident()
 
     def drop(record: logging.LogRecord) -> bool:
@@ -54,7 +54,7 @@ def _quiet(log: logging.Logger) -> Iterator[None]:
 
 
 def _count_faces(data: bytes, suffix: str) -> int:
-    """Return how many faces the file says it has; 0 where only its size bounds them."""
+    """Return the number of faces that a file declares; 0 if only its size bounds them."""
     if suffix == ".obj":
         return data.count(b"\nf")
     if suffix == ".stl":
@@ -64,7 +64,7 @@ def _count_faces(data: bytes, suffix: str) -> int:
 
 
 def _read_header(data: bytes) -> int:
-    """Return the faces of a .ply, by its header; as its reader does, take what only contains the words for them."""
+    """Return the number of faces in the header of a .ply, read as leniently as trimesh does."""
     properties = faces = 0
     for line in io.BytesIO(data[:PLY_HEADER_BYTES]):
         words = line.split()
@@ -81,7 +81,7 @@ def _read_header(data: bytes) -> int:
 
 
 def _geometry(data: bytes) -> bytes:
-    """Return vertices and faces of an .obj: trimesh takes minutes for 30,000 groups or materials."""
+    """Return only the vertices and faces of an .obj: trimesh is slow with many groups or materials."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     kept = (line for line in map(bytes.strip, lines) if line[:2] in (b"v ", b"f ", b"v\t", b"f\t"))
     return b"\n".join(line if line[:1] == b"v" else _REFERENCE.sub(b"", line) for line in kept)

@@ -1,4 +1,4 @@
-"""The public law for hands: what planning and closing need of a hand of your own."""
+"""The check of a hand: planning and closing rely on these rules and laws."""
 
 import io
 from collections.abc import Iterator
@@ -19,23 +19,23 @@ from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
 
 FK_POSTURES = 50
-"""Random postures in which kinematics are compared, a millisecond each."""
+"""Number of random postures in which kinematics are compared."""
 FK_TOLERANCE = 1e-8
-"""Largest difference [m, and entries of rotations] from other libraries' poses; rounding leaves 1e-15."""
+"""Largest difference [m, and entries of rotations] from the poses of other libraries."""
 STEP, JACOBIAN_TOLERANCE = 1e-6, 1e-6
-"""Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian: they are off by 1e-10."""
+"""Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian."""
 
 
 @checked
 def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Check a shipped hand, or one in a folder, with a choice of fingers, and return it.
 
-    The rules for its files are about coupling, limits, drives, masses, pads, parked joints and self-collision. The
-    laws for what is made of them, by the name that an error gives them:
+    The rules for its files concern coupling, limits, drives, masses, pads, parked joints and self-collision. The laws
+    for the loaded hand, by the names that errors give them:
 
-    * `kinematics`: every link is where pytorch-kinematics and yourdfpy, which applies `<mimic>` by itself, place it.
-    * `jacobian`: that of the fingertips equals central differences.
-    * `batch`: a batch of postures equals each alone, and a batch of none is empty.
+    * `kinematics`: the poses of all links are those of pytorch-kinematics and of yourdfpy.
+    * `jacobian`: the Jacobian of the fingertips equals central differences.
+    * `batch`: the rows of a batch equal single postures, and an empty batch is empty.
 
     Raises:
         HandFileError: a file breaks a rule; the message names the file, what was found and what is allowed.
@@ -94,7 +94,7 @@ def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
 
 
 def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
-    """Return the links that overlap in most of some postures."""
+    """Return the two links that overlap in the most postures."""
     apart = hand.self_collision.separations(hand.tree.frames(hand.expand_joints(joints).T.contiguous()), 0.0)
     links = hand.self_collision.link[hand.self_collision.pairs[int((apart < 0).sum(1).argmax())]]
     one, two = (hand.tree.link_names[int(k)] for k in links)
@@ -102,7 +102,7 @@ def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
 
 
 def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
-    """Find masses and inertias that no body can have."""
+    """Find masses and inertias that are physically impossible."""
     for link in urdf.links:
         if not link.mass > 0:
             yield urdf.wrong(f"link {link.name} of mass {link.mass} kg", "a positive mass")
