@@ -42,7 +42,7 @@ class HandCheck(Command):
         if self.out.suffix.lower() != ".png":
             raise BadArgument("--out", self.out, "a file ending in .png")
         chosen = "default" if self.fingers == "auto" else self.fingers
-        with make_bar(None, "step", desc="faults", delay=1) as bar:
+        with make_bar(None, "step", desc="faults") as bar:
             if print_faults(self.hand, chosen):
                 return 2
             sound = check_hand(self.hand, chosen)
@@ -53,16 +53,20 @@ class HandCheck(Command):
             missing = f"none; only the modes of the paper need one: torchgrasp hand train {self.hand}"
             bar.write(f"learned model: {model if model.exists() else missing}")
             hands = finger_sets(sound, "auto" if self.fingers == "auto" else None)
+            bar.total = 1 + 2 * len(hands)
+            bar.update()
             for one in hands:
                 bar.set_description(f"postures of {one.source.option}")
                 for warning in find_warnings(one, random_joints(one, len(joints))):
                     bar.write(f"doubtful: {one.source.option}: {warning}")
+                bar.update()
             write_file(self.out, draw_hand(sound, opposed_posture(sound, joints)))
             bar.write(f"picture: {self.out}")
             able = False
             for one in hands:
                 bar.set_description(f"grasps of {one.source.option}")
                 able = _try_objects(one, bar) or able
+                bar.update()
         if able:
             print("the hand can grasp")
         return 0 if able else 1
