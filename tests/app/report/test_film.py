@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from torchgrasp.app.report.canvas import ALARM, rgb
-from torchgrasp.app.report.film import STILL, TITLE, WIDTH, describe_film, draw_film
+from torchgrasp.app.report.film import STILL, TITLE, WIDTH, _list_plots, describe_film, draw_film
 from torchgrasp.app.report.moments import explain_loss, find_loss, moments_of, moved_in_hand
 from torchgrasp.closure import ClosingTrace
 from torchgrasp.errors import Status
@@ -163,3 +163,13 @@ def test_trials_that_ended_at_once_or_diverged_have_a_film(run, closing):
     for closure in (stuck, lost(closing, Status.UNSTABLE, joints=joints)):
         assert draw_film(run.mesh, run.hand, closure, (1.0, 0.0, 0.3))
         assert closure.status.sentence in describe_film(run.mesh, run.hand, closure)
+
+
+def test_the_plots_have_the_forces_and_motions_of_the_closing(run, closing):
+    plots = {title.split(" [")[0]: lines for title, _, lines in _list_plots(run.mesh, run.hand, closing)}
+    for (values, _, label), force in zip(plots["normal force"], closing.forces.numpy().T, strict=True):
+        np.testing.assert_array_equal(values, force)
+        assert label.split(". ")[1] in run.hand.tips.names
+    moved = {label: values for values, _, label in plots["motion"]}
+    np.testing.assert_allclose(moved["object from its place"], 1e3 * closing.object_pose[:, 2, 3], atol=1e-9)
+    assert np.isnan(moved["object in the hand since pressed"][:50]).all()
