@@ -69,7 +69,7 @@ def fit_shape(
 
     Args:
         cloud: points [m] of one object, of one view or of several (`merge_clouds`), prepared by `prepare_cloud`. Given
-            normals tell a whole surface from a view. Walls thinner than the cloud's spacing merge,
+            normals distinguish a whole surface from a view. Walls thinner than the cloud's spacing merge,
             but an open vessel seen from above on a `table` has two walls (`HollowShape`).
         noise: standard deviation of an observed signed distance, normalised; for "paper" of normals too.
         budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. None:

@@ -160,7 +160,7 @@ def free_space(
             points = torch.cat([points, torch.cat([ground, height], 1)])
             least = torch.cat([least, torch.full_like(ground[:, 0], below)])
     x = (points - origin) / scale
-    keep = (torch.linalg.vector_norm(x, dim=-1) < MAX_RADIUS) & (least > 0.001)  # a smaller one says nothing
+    keep = (torch.linalg.vector_norm(x, dim=-1) < MAX_RADIUS) & (least > 0.001)  # a smaller distance is no constraint
     return x[keep].to(frame.center), least[keep].to(frame.center) / scale
 
 

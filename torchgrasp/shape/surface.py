@@ -23,18 +23,13 @@ from torchgrasp.threads import single_threaded
 if TYPE_CHECKING:
     import trimesh
 
-NEWTON_STEPS, SHORT = 3, 1e-4
-"""Newton steps from marching cubes onto the zero level, at most, and the length of one, normalised, after which a
-vertex rests: the next is of the order of its square. Enough for 1e-6 of the scale."""
 RESOLUTION = 48
-"""Cells along the domain's diameter: 4 mm on a hand-sized object."""
+"""Cells along the domain's diameter."""
 COARSE, STEEPER = 4, 1.3
-"""Cells along the side of the first blocks of the grid, and the steepest slope of the mean over that between their
-corners: 1.1 at most on 16 views. Where no corner of a block is near zero, no node in it is evaluated."""
-LEAST_SLOPE = 1e-12
-"""Least squared gradient with which a Newton step is computed: a stationary vertex stays."""
+"""Cells along the side of the first blocks of the grid, and a bound on the slope of the mean within a block over
+the slope between its corners: blocks that the zero level cannot reach are not refined."""
 LEAST_SHARE = 0.02
-"""Share of the cloud nearest to a sheet of the zero level from which on the sheet is kept: an ear, a handle."""
+"""Least share of the cloud nearest to a sheet of the zero level that is kept."""
 
 
 @checked
@@ -124,11 +119,11 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
     x = torch.from_numpy(corners[used].astype(np.float64) - radius).to(device)
     faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
     normals, rows = torch.zeros_like(x), torch.arange(len(x), device=device)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(3):
         value, gradient = shape.mean_and_gradient(x[rows])
-        motion = limit_norm(newton_step(value, gradient, gradient, LEAST_SLOPE)[:, None] * gradient, step)
+        motion = limit_norm(newton_step(value, gradient, gradient, 1e-12)[:, None] * gradient, step)
         x[rows], normals[rows] = x[rows] + motion, gradient
-        rows = rows[torch.linalg.vector_norm(motion, dim=-1) > SHORT]
+        rows = rows[torch.linalg.vector_norm(motion, dim=-1) > 1e-4]
     if others:  # the cut turns triangles around, so they are wound after it
         value = torch.stack([wall.mean(x) for wall in others]).amax(0)
         vertices, triangles, _ = clip_mesh(x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy())
@@ -144,8 +139,8 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
 def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     """Return the mean on a grid from -radius on along each axis, NaN outside the ball.
 
-    Blocks of cells are halved where the zero level may pass. Elsewhere nodes have the mean of a node nearby: its sign
-    is theirs.
+    Blocks of cells are halved where the zero level may pass. Other nodes copy the value of a node nearby; only its
+    sign is used.
     """
     line = -radius + step * torch.arange(cells + 1, dtype=torch.float64, device=shape.x.device)
 
@@ -178,7 +173,7 @@ def _least_corner(values: np.ndarray) -> np.ndarray:
 
 
 def _touched(cells: np.ndarray) -> np.ndarray:
-    """Tell which nodes of a grid are corners of cells."""
+    """Return which nodes of a grid are corners of cells."""
     nodes = np.pad(cells, 1)
     for axis in range(3):
         along = np.moveaxis(nodes, axis, 0)
@@ -197,7 +192,7 @@ def newton_step(
 
 
 def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
-    """Tell which faces belong to sheets that carry enough of the cloud."""
+    """Return which faces belong to sheets near enough of the cloud."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
@@ -214,7 +209,7 @@ def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.n
 @checked
 @single_threaded
 def surface_field(shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING) -> SignedDistanceField:
-    """Return the signed distance field of a shape's estimated surface: by it touches tell where the object is.
+    """Return the signed distance field of a shape's estimated surface, for localization by touch.
 
     The nodes are `spacing` [m] apart.
 

@@ -26,26 +26,21 @@ from torchgrasp.shape.completion.symmetry import (
 from torchgrasp.shape.posterior import symmetric_root
 from torchgrasp.values import PointCloud
 
-HULL_MARGIN, FRONT_MARGIN, TABLE_MARGIN = 0.001, 0.002, 0.002
-"""A mirrored point may lie this far [m] outside the hull, in front of the visible surface, below the table."""
+HULL_MARGIN, FRONT_MARGIN = 0.001, 0.002
+"""A hidden point may be this far [m] outside the hull, and in front of the visible surface or below the table."""
 NEW, SPACING = 0.006, 0.004
-"""Least distance [m] of a mirrored point from the cloud and from another one."""
-FACE, DOWN = 0.004, 0.7
-"""Height [m] over the table of its face, and how far down its normals point: such points took the place of others."""
+"""Least distance [m] of a hidden point from the cloud and from another hidden point."""
 LEAST_NOISE = 0.003
 """Standard deviation [m] of a mirrored point of an object that is symmetric about that very plane."""
 SYMMETRIC, ASYMMETRY = 0.45, 0.060
 """Score from which on an object counts as symmetric, and its asymmetry [m] for each 1 of score that is missing."""
-MIN_ATTACHED = 20
-"""Points beside a body of revolution from which on they are a part with a plane of its own."""
 PART = 0.02
-"""Length scale [m] of the asymmetry: a part that is missing on the other side is missing as a whole."""
+"""Length scale [m] of the asymmetry: a part without a mirror image is missing as a whole."""
 TEMPERATURE = 0.1
 """A plane's probability is proportional to exp(score / temperature)."""
 NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045
-"""Planes tried near one for its uncertainty: steps of each axis, greatest angle [rad] and share of the cloud's size."""
-PENALTY = 0.05
-"""Score that an image of an image loses: of two equal points the one mirrored once is kept."""
+"""Planes compared with a plane for its uncertainty: steps of each axis, greatest angle [rad] and shift over the
+cloud's size."""
 
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
 """What a hidden side follows from: an ellipsoid, an axis, mirror planes, or nothing but the outline."""
@@ -62,7 +57,7 @@ class Completion(Value):
         shared: standard deviations [m] of the errors by plane.
         asymmetry: standard deviation [m] of the smooth field.
         planes: the planes n.x = o that were used, as (n, o), the best of each part first.
-        scores: of the planes: 1 if the mirror image lies on the cloud, below .15 for no support.
+        scores: of the planes: 1 if the mirror image is on the cloud, near 0 without support.
         kind: what the points follow from, by which the bands are calibrated.
 
     >>> from torchgrasp import load_object
@@ -119,7 +114,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     may exclude a point, and no other point may be near. Low scores mean large asymmetry.
 
     A body of revolution and its attached part are mirrored separately, in the frame of the axis. Any plane through the
-    axis explains the body. The part alone tells the plane of a handle.
+    axis explains the body. The plane of a handle follows from the part alone.
 
     The cloud is clean, with outward normals and viewpoints; others raise `BadArgument`. The table has its height [m]
     and normal z.
@@ -133,7 +128,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     if cloud.normals is None or cloud.viewpoint is None:
         raise BadArgument("cloud", "no normals or no viewpoint", "outward normals and viewpoints: see prepare_cloud")
     scorer = SymmetryScorer.of(cloud.to("cpu", torch.float64), table)
-    if scorer.outline.cut:  # an image's border is no outline, and half a thing is not symmetric
+    if scorer.outline.cut:  # an image's border is no outline, and half an object is not symmetric
         return _nothing(scorer)
     ball = find_ellipsoid(scorer.points, scorer.normals, scorer.outline, table)
     if ball is not None:
@@ -235,7 +230,7 @@ class _Mirror:
         shared = of.shared.clone()  # a mirror leaves errors across the surface as they are
         shared[:, self.number] += (self.weight.sqrt()[:, None] * shift).T
         variance = of.variance + (ASYMMETRY * max(SYMMETRIC - self.score, 0.0)) ** 2
-        score = self.score if math.isinf(of.score) else min(of.score, self.score) - PENALTY
+        score = self.score if math.isinf(of.score) else min(of.score, self.score) - 0.05
         return _Image(points, normals, score, variance, shared)
 
 
@@ -247,7 +242,7 @@ def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]
     rows, rest = every[revolution.body], every[~revolution.body]
     body, attached = scorer.for_part(rows), scorer.for_part(rest)
     parts = [_Part(body, rows, *find_planes(body, turned=True))]
-    if len(rest) >= MIN_ATTACHED:
+    if len(rest) >= 20:
         plane = find_plane_through_axis(attached, revolution.center, scorer.points[rest])
         parts.append(_Part(attached, rest, *plane))
     return parts
@@ -258,7 +253,7 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
     total, images, before = sum(len(part.planes) for part in parts), [], 0
     for part in parts:
         original = _Image.of(part.scorer, part.rows, total)
-        if len(part.rows) == len(part.scorer.points):  # of a part the outline says nothing
+        if len(part.rows) == len(part.scorer.points):  # the outline is of the whole cloud
             original = original.with_rim(part.scorer.outline)
         mirrors = [
             _Mirror.of(part.scorer, before + i, plane, score)
@@ -286,17 +281,17 @@ def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Ima
 
 
 def _allowed(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Tell which points neither a view nor the table excludes."""
+    """Return which points neither a view nor the table excludes."""
     outline = scorer.outline
     allowed = (outline.hull_distance(points) < HULL_MARGIN) & (outline.violation(points) < FRONT_MARGIN)
-    return allowed if scorer.table is None else allowed & (scorer.table.height(points) > -TABLE_MARGIN)
+    return allowed if scorer.table is None else allowed & (scorer.table.height(points) > -FRONT_MARGIN)
 
 
 def _on_table(scorer: SymmetryScorer, image: _Image) -> Bool[Tensor, "n"]:
-    """Tell which points lie on the face on the table, which needs none: free space holds it."""
+    """Return which points are on the face on the table, which free space bounds already."""
     if scorer.table is None:
         return torch.zeros(len(image), dtype=torch.bool)
-    return (scorer.table.height(image.points) < FACE) & (image.normals @ scorer.table.normal < -DOWN)
+    return (scorer.table.height(image.points) < 0.004) & (image.normals @ scorer.table.normal < -0.7)
 
 
 def _thin(points: Float[Tensor, "n 3"]) -> Tensor:

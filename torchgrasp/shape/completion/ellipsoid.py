@@ -1,7 +1,7 @@
-"""Balls and fruit: an ellipsoid, nearly a ball, that the whole cloud lies on.
+"""Balls and fruit: an ellipsoid, nearly a ball, that fits the whole cloud.
 
-Every plane through the centre of a ball explains it, so the planes say nothing about its depth. The fit does: it uses
-the normals, the outline and the table, and its covariance says how sure it is.
+Every plane through the centre of a ball explains it, so planes do not determine its depth. The fit does: it uses
+the normals, the outline and the table, and its covariance is the uncertainty.
 """
 
 import dataclasses
@@ -15,23 +15,14 @@ from torch import Tensor
 from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, unit
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 
-PROBES = 300
-"""Points of the cloud that are fitted."""
 INDEPENDENT, INDEPENDENT_RIM = 60, 8
-"""Points of the cloud and of the rim that count as independent: cleaning and the outline tie neighbours together."""
+"""Points of the cloud and of the outline that count as independent: neighbours are correlated."""
 POINT_NOISE, SLOPE_NOISE, RIM_NOISE, TABLE_NOISE = 0.001, 0.15, 0.002, 0.001
-"""Standard deviations [m] of a point, of its normal (without unit), of the outline, and of the table."""
+"""Standard deviations of a point [m], of its normal, of the outline [m] and of the table [m]."""
 ELONGATION = 0.03
-"""Standard deviation of the logarithm of an axis over the mean one: of .005 to .2 the best on two families of small
-balls and fruit, 1.5 mm on the hidden side."""
+"""Standard deviation of the logarithm of an axis over the mean axis."""
 MAX_MISFIT, MAX_RELATIVE_MISFIT = 0.00165, 0.052
-"""Greatest RMS distance of the cloud from the ellipsoid, in metres and in mean radii: balls and fruit stay below."""
-MAX_RATIO, LEAST_AGREEMENT = 1.5, 0.9
-"""Greatest ratio of two axes, and least mean cosine between the normals: other things are long, flat or hollow."""
-GRID = 400
-"""Points of the ellipsoid among which hidden ones are chosen."""
-STEP = 1e-5
-"""Step of the differences by the parameters [m, or without unit]."""
+"""Greatest RMS distance of the cloud from the ellipsoid, in metres and in mean radii."""
 FORWARD = float(np.sqrt(np.finfo(float).eps))
 """The same while it is fitted, over a parameter or 1, whichever is more: half the digits."""
 UPPER = np.triu_indices(3)
@@ -57,7 +48,7 @@ class Ellipsoid:
 def find_ellipsoid(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], outline: Outlines, table: float | None
 ) -> Ellipsoid | None:
-    """Return the ellipsoid, nearly a ball, that the whole cloud lies on; None: it is no ball.
+    """Return the ellipsoid, nearly a ball, that fits the whole cloud; None: it is no ball.
 
     The body may be flat where it stands: its ellipsoid may reach below the table, not hang above it.
 
@@ -69,7 +60,7 @@ def find_ellipsoid(
     >>> bool((found.points.norm(dim=1) - 0.03).abs().max() < 0.001)
     True
     """
-    rows = farthest_points(points, PROBES, tie=TIE)
+    rows = farthest_points(points, 300, tie=TIE)
     fit = _Fit(points[rows].numpy(), normals[rows].numpy(), outline, table)
     parameters, covariance = fit.solve()
     one = parameters[None]
@@ -77,15 +68,15 @@ def find_ellipsoid(
     distance, normal = (x[0] for x in fit.distance_and_normal(one))
     misfit = float(np.sqrt((distance**2).mean()))
     agreement = float((normal * fit.normals).sum(1).mean())
-    if misfit > min(MAX_MISFIT, MAX_RELATIVE_MISFIT * float(axes.mean())) or agreement < LEAST_AGREEMENT:
+    if misfit > min(MAX_MISFIT, MAX_RELATIVE_MISFIT * float(axes.mean())) or agreement < 0.9:
         return None
-    if axes[2] > MAX_RATIO * axes[0]:
+    if axes[2] > 1.5 * axes[0]:
         return None
     root = torch.from_numpy(_exponential(one[:, 3:])[0])
-    direction = fibonacci_sphere(GRID)
+    direction = fibonacci_sphere(400)
     across = unit(direction @ torch.linalg.inv(root))
-    moved = _support(one + STEP * np.eye(9), across.numpy()) - _support(one, across.numpy())
-    spread = torch.from_numpy(moved.T / STEP @ np.linalg.cholesky(covariance))
+    moved = _support(one + 1e-5 * np.eye(9), across.numpy()) - _support(one, across.numpy())
+    spread = torch.from_numpy(moved.T / 1e-5 @ np.linalg.cholesky(covariance))
     return Ellipsoid(torch.from_numpy(parameters[:3]) + direction @ root, across, spread, misfit)
 
 

@@ -14,22 +14,14 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import farthest_points, unit
 from torchgrasp.values import PointCloud
 
-CELLS = 4.0
-"""Cells of the raster for the typical spacing of the cloud's pixels."""
-MAX_CELLS = 320
-"""Cells of the raster along the cloud's longer side, at most."""
 GROW, SHRINK = 2.0, 1.65
-"""The outline is the union of discs of 2 spacings about the pixels, shrunk by 1.65: holes close, the rim stays."""
+"""The outline is the union of discs about the pixels, then shrunk; both in spacings of the pixels."""
 FRONT_MARGIN = 0.002
-"""A point may lie this far [m] in front of the visible surface: noise of the camera."""
-BEHIND, PIXELS = 0.3, 6
-"""A point lies behind one of its six nearest pixels when it is deeper by this share of the cloud's radius than a slope
-of 45 degrees would explain."""
+"""A point may be this far [m] in front of the visible surface: noise of the camera."""
 MAX_BEHIND = 0.2
-"""Share of points behind others in a single view, at most: between views and whole surfaces (docs/shape.md)."""
+"""Greatest share of points behind others in a single view."""
 TIE = 2e-9
-"""Relative difference of squared distances that rounding can make: on a raster many points are equally far, and the
-frame must not decide between them."""
+"""Relative difference of squared distances that rounding can make: the frame must not decide between equal ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,7 +175,7 @@ def silhouette(view: PointCloud) -> Silhouette:
     spacing = float(np.median(distance[:, -1]))
     low, high = pixels.min(0), pixels.max(0)
     extent = float((high - low).max())
-    cell = max(spacing / CELLS, extent / MAX_CELLS)
+    cell = max(spacing / 4.0, extent / 320)
     margin = int(np.ceil(GROW * spacing / cell)) + int(0.25 * extent / cell) + 2
     shape = tuple(np.ceil((high - low) / cell).astype(int)[::-1] + 2 * margin + 1)
     corner = low - margin * cell
@@ -221,7 +213,7 @@ def silhouette(view: PointCloud) -> Silhouette:
 def _beyond_image(
     frustum: Tensor | None, axes: np.ndarray, corner: np.ndarray, cell: float, mask: np.ndarray, margin: float
 ) -> np.ndarray:
-    """Tell which cells lie beyond a side of the image, or nearer to it than `margin`, that the mask reaches."""
+    """Return which cells are beyond a side of the image that the mask reaches, or within `margin` of it."""
     beyond = np.zeros(mask.shape, dtype=bool)
     if frustum is None:
         return beyond
@@ -244,11 +236,11 @@ def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> 
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
         raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
     _, pixels, depth = _project(points, viewpoint)
-    apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(PIXELS, len(pixels)))
+    apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(6, len(pixels)))
     deeper = depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
     points = points.double().cpu()
     radius = torch.linalg.vector_norm(points - (points.amax(0) + points.amin(0)) / 2, dim=-1).max()
-    share = float((deeper.amax(1) > BEHIND * radius).double().mean())
+    share = float((deeper.amax(1) > 0.3 * radius).double().mean())
     if share > MAX_BEHIND:
         found = f"{share:.0%} of the points behind others, which no camera sees at once"
         raise BadArgument("cloud", found, "a single view, the viewpoint of each point, or outward normals")

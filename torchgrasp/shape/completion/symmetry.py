@@ -15,50 +15,32 @@ from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
 
 MATCH_DISTANCE = 0.003
-"""Distance [m] over which a mirrored point stops matching the cloud: a few times the camera's noise."""
+"""Distance [m] over which a mirrored point stops matching the cloud."""
 PROBES = 150
 """Points of the cloud that score a plane."""
-LEAF = 32
-"""Points in a leaf of their tree: a fifth less time than with SciPy's 10, the same distances."""
 OFFSETS, FINE_OFFSETS = 17, 65
-"""Offsets tried for each direction of a plane, and for one whose direction is known."""
-ANGLES, FINE_ANGLES = 24, 96
-"""Directions of vertical planes tried on a table, and about a known axis."""
-DIRECTIONS = 80
-"""Directions of planes tried without a table."""
+"""Offsets tried for each direction of a plane, and for a known direction."""
 MIN_FACING, FACING = 0.35, 0.7
-"""Cosine of a plane's normal with the view below which the plane hides no points, and from which it lies across."""
-ONE_SIDED = 0.05
-"""Length of the mean direction of view from which on one side of the object was not seen."""
+"""Cosine of a plane's normal with the view below which the plane hides no points, and above which it is frontal."""
 RIM_PRIOR = 0.15
 """Loss of score at a quarter of the cloud's size from the rim, without a table: a view ends near the mirror plane."""
-MAX_PLANES = 4
-"""Mirror planes used, at most, beside the one across the view."""
 WITHIN = 0.12
-"""Planes are used whose score is within this of the best."""
-SQUARE, SQUARE_PRIOR = 0.1, 0.1
-"""Greatest cosine between planes at right angles, and the score that a plane gains by being at right angles to the
-best: most objects with two mirror planes have them so, and a view may show only one."""
+"""Greatest loss of score against the best plane."""
 APART = math.cos(math.radians(25.0))
 """Cosine of the least angle between two planes: closer ones mirror to the same points."""
 MAX_VIOLATION = 0.15
-"""Mean violation of free space, in [0, 1], that a plane may have which is added for what it hides."""
+"""Greatest mean violation of free space, in [0, 1], of a plane added for the points that it hides."""
 SLOPE = 0.15
-"""A plane nearer than `APART` to the best one is left out if its score is less by this: boxes lose .2 in 10 degrees,
-cans .1. With 0.1 the hidden side of cans was off by 2.3 mm, with 0.15 by 1.9 (docs/shape.md)."""
-COVERED = 0.42
-"""Cosine of the angle, 65 degrees, within which another plane stands for the one at right angles to the best."""
+"""A plane near the best one is dropped if its score is less by this: it matches only because it is near."""
 AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.4
 """The axis of a body of revolution in its frame, and the least score of the plane that mirrors its ends."""
-LEVEL_SCORE = 0.0
-"""Least score of the level plane: with .3 undersides gained half as much."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryScorer:
     """Scores mirror planes: mirrored `probes` against the cloud, its outlines and the table.
 
-    `upright` tells that z is an axis which every plane keeps: the vertical, or the axis of a body of revolution.
+    `upright` means that all planes are parallel to z: the vertical, or the axis of a body of revolution.
     """
 
     points: Tensor
@@ -77,7 +59,7 @@ class SymmetryScorer:
 
         assert cloud.normals is not None
         points, normals, plane = cloud.points, cloud.normals, None if table is None else Plane.horizontal(table)
-        tree, upright = KDTree(points.numpy(), leafsize=LEAF), table is not None
+        tree, upright = KDTree(points.numpy(), leafsize=32), table is not None
         whole = cls(points, normals, tree, silhouettes(cloud), plane, upright, points[:0], normals[:0])
         return whole.for_part(torch.arange(len(cloud)))
 
@@ -88,7 +70,7 @@ class SymmetryScorer:
         points, normals = apply(axis_from_cloud, self.points), rotate(axis_from_cloud, self.normals)
         table = None if self.table is None else self.table.moved(axis_from_cloud)
         probes, probe_normals = apply(axis_from_cloud, self.probes), rotate(axis_from_cloud, self.probe_normals)
-        outline, tree = self.outline.moved(axis_from_cloud), KDTree(points.numpy(), leafsize=LEAF)
+        outline, tree = self.outline.moved(axis_from_cloud), KDTree(points.numpy(), leafsize=32)
         return SymmetryScorer(points, normals, tree, outline, table, True, probes, probe_normals)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
@@ -134,24 +116,24 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Float[Ten
     """Return the mirror planes of a cloud, best first, and their scores.
 
     Planes come from a grid, vertical ones on a table. The best are refined. On a table one at right angles to the best
-    of all is added where none lies near it: its own score says little, since its images are hidden. A level plane
+    of all is added where none is near it: its own score is not informative, since its images are hidden. A level plane
     halfway up shows the underside. A body of revolution (`turned`) needs neither: all planes through its axis match.
     """
     view = torch.stack([unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]).mean(0)
     if not scorer.upright:
-        directions = fibonacci_sphere(2 * DIRECTIONS)[:DIRECTIONS]  # half a sphere: n and -n are one
+        directions = fibonacci_sphere(160)[:80]  # half a sphere: n and -n are one
     else:
-        directions = _level_directions(ANGLES)
+        directions = _level_directions(24)
         view = view * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
     # From above, or from sides that are far apart, no side alone is hidden, and every plane may add points.
-    across = unit(view) if float(torch.linalg.vector_norm(view)) > ONE_SIDED else None
+    across = unit(view) if float(torch.linalg.vector_norm(view)) > 0.05 else None
     grid = _plane_grid(scorer, directions)
     scores = scorer.score(grid.reshape(-1, 4))[0].reshape(grid.shape[:2])
     if not scorer.upright:
         rim = (scorer.outline.rim @ directions.T).median(0).values
         scores = scores - RIM_PRIOR * ((grid[..., 3] - rim[:, None]) / (0.25 * scorer.size)) ** 2
     strongest = int(scores.max(1).values.argmax())
-    scores = scores + SQUARE_PRIOR * ((directions @ directions[strongest]).abs() < SQUARE)[:, None]
+    scores = scores + 0.1 * ((directions @ directions[strongest]).abs() < 0.1)[:, None]
 
     planes = [_refine(scorer, grid[i, k]) for i, k in _pick_planes(scores, directions, across)]
     if scorer.table is None or turned:
@@ -178,7 +160,7 @@ def find_plane_through_axis(
 
     Prefers the plane with least extent normal to it, even if the other half is occluded.
     """
-    normals = _level_directions(FINE_ANGLES)
+    normals = _level_directions(96)
     planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
     arm = part[:, :2] - center
     extent = (arm @ normals[:, :2].T).square().mean(0) / arm.square().sum(1).mean()
@@ -229,7 +211,7 @@ def _pick_planes(
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if hides[i]]
     chosen: list[int] = []
     for i in order:
-        if len(chosen) == MAX_PLANES or best[i] <= best[order[0]] - WITHIN:
+        if len(chosen) == 4 or best[i] <= best[order[0]] - WITHIN:
             break
         if all(abs(float(directions[i] @ directions[j])) < APART for j in chosen):
             chosen.append(i)
@@ -237,14 +219,14 @@ def _pick_planes(
 
 
 def _hides(directions: Float[Tensor, "d 3"], across: Float[Tensor, "3"] | None) -> Bool[Tensor, "d"]:
-    """Tell which planes with these normals hide points from a view; without one view all may."""
+    """Return which planes with these normals hide points from a view; without a single view, all."""
     return torch.ones(len(directions), dtype=torch.bool) if across is None else (directions @ across).abs() > MIN_FACING
 
 
 def _without_slope(
     scorer: SymmetryScorer, planes: list[Float[Tensor, "4"]], best: Float[Tensor, "4"]
 ) -> list[Float[Tensor, "4"]]:
-    """Drop planes that only match because they are nearly the best one, which itself may hide nothing."""
+    """Drop near-duplicates of the best plane, which itself may hide no points."""
     least = float(scorer.score(best[None])[0]) - SLOPE
     return [p for p in planes if abs(float(p[:3] @ best[:3])) < APART or float(scorer.score(p[None])[0]) > least]
 
@@ -255,7 +237,7 @@ def _across_plane(
     grid: Float[Tensor, "d k 4"],
     across: Float[Tensor, "3"] | None,
 ) -> Float[Tensor, "p 4"]:
-    """Return the best plane across the view if none lies so; none if all violate free space."""
+    """Return the best plane across the view if no plane is; none if all violate free space."""
     if across is None or any(abs(float(plane[:3] @ across)) > FACING for plane in planes):
         return grid.new_zeros(0, 4)
     found = _best_plane(scorer, grid[(grid[:, 0, :3] @ across).abs() > FACING].reshape(-1, 4), -math.inf)
@@ -268,9 +250,9 @@ def _square_plane(
     best: Float[Tensor, "4"],
     across: Float[Tensor, "3"] | None,
 ) -> Float[Tensor, "p 4"]:
-    """Return the best vertical plane at right angles to another, if it hides points and no plane lies near it."""
+    """Return the best vertical plane at right angles to another, if it hides points and no plane is near it."""
     direction = torch.stack([-best[1], best[0], torch.zeros_like(best[0])])[None]
-    near = any(abs(float(plane[:3] @ direction[0])) > COVERED for plane in planes)
+    near = any(abs(float(plane[:3] @ direction[0])) > 0.42 for plane in planes)
     if near or not bool(_hides(direction, across)):
         return best.new_zeros(0, 4)
     return _best_plane(scorer, _plane_grid(scorer, direction, FINE_OFFSETS)[0], -math.inf)
@@ -279,7 +261,7 @@ def _square_plane(
 def _level_plane(scorer: SymmetryScorer, table: Plane) -> Float[Tensor, "p 4"]:
     """Return the level plane halfway up an object on a table; none if it matches nothing."""
     half = (scorer.points[:, 2].max() + table.offset) / 2
-    return _best_plane(scorer, torch.stack([0 * half, 0 * half, 0 * half + 1, half])[None], LEVEL_SCORE)
+    return _best_plane(scorer, torch.stack([0 * half, 0 * half, 0 * half + 1, half])[None], 0.0)
 
 
 def _best_plane(scorer: SymmetryScorer, planes: Float[Tensor, "k 4"], least: float) -> Float[Tensor, "p 4"]:
