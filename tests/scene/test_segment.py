@@ -2,16 +2,13 @@ import pytest
 import torch
 import trimesh
 
+from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.segment import on_surface, segment
 
 TABLE = Plane.horizontal(0.0)
-
-
-def box(size, place):
-    return trimesh.creation.box(size).apply_translation(place)
 
 
 def cup():

@@ -4,6 +4,7 @@ import pytest
 import torch
 import trimesh
 
+from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.errors import BadArgument, NoSupport
@@ -12,10 +13,6 @@ from torchgrasp.scene.support import fit_support
 
 POSE = look_at(30.0, 40.0, 0.6)
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-
-
-def box(size, place):
-    return trimesh.creation.box(size).apply_translation(place)
 
 
 THINGS = [

@@ -172,19 +172,6 @@ def test_no_points_have_an_empty_estimate(half_ball: ShapeGP):
     assert found.covariance.shape == (2, 0, 4, 4) and found.std_m.shape == (2, 0)
 
 
-def test_an_estimate_passes_gradients_to_its_points_as_finite_differences_say(half_ball: ShapeGP):
-    points = half_ball.metres(_queries(half_ball, 4)).requires_grad_()
-
-    def values(points: Tensor) -> tuple[Tensor, ...]:
-        found = half_ball.predict(points)
-        return found.distance, found.normal, found.variance, 100 * found.std_m
-
-    assert torch.autograd.gradcheck(values, points, eps=1e-7, atol=1e-4)
-    assert not half_ball.predict(points).covariance.requires_grad
-    with torch.no_grad():
-        assert not half_ball.predict(points).distance.requires_grad
-
-
 def test_a_sum_of_an_estimate_and_other_terms_is_minimised_on_the_surface(half_ball: ShapeGP):
     points = half_ball.metres(0.8 * _queries(half_ball, 3)).float().requires_grad_()
     for _ in range(60):

@@ -159,13 +159,3 @@ def test_a_thin_wall_has_no_holes(seed: int):
     across = torch.stack([middle + s * out for s in torch.linspace(-0.004, 0.004, 17, dtype=torch.float64)], 1)
     material = (shape.predict(across).distance < 0).any(1)
     assert material.double().mean() > 0.96
-
-
-def test_an_estimate_passes_the_gradient_of_its_own_wall(vessel: HollowShape):
-    points = torch.cat([ring(RADIUS, 0.03, 0.04)[0][:2], ring(RADIUS - WALL, 0.03, 0.04)[0][:2]]).requires_grad_()
-
-    def values(points: Tensor) -> tuple[Tensor, ...]:
-        found = vessel.predict(points)
-        return found.distance, found.normal, 100 * found.std_m
-
-    assert torch.autograd.gradcheck(values, points, eps=1e-7, atol=1e-3)

@@ -81,11 +81,6 @@ class Scene(Value):
             BadArgument: what `read_depth` refuses; mask or labels of another size; a target that is the table; a
                 point where nothing was measured; a camera below the table.
             NoSupport: no plane that objects stand on.
-
-        >>> from torchgrasp import load_scene
-        >>> image = load_scene().image
-        >>> len(Scene.from_depth(image.depth, image.intrinsics, image.obj_from_camera).things) > 1
-        True
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")

@@ -59,12 +59,6 @@ class Completion(Value):
         planes: the planes n.x = o that were used, as (n, o), the best of each part first.
         scores: of the planes: 1 if the mirror image is on the cloud, near 0 without support.
         kind: what the points follow from, by which the bands are calibrated.
-
-    >>> from torchgrasp import load_object
-    >>> from torchgrasp.cloud import estimate_normals
-    >>> found = complete_cloud(estimate_normals(load_object("jug").view))
-    >>> found.kind, len(found.points) == len(found.moved(torch.eye(4).double()).normals)
-    ('revolution', True)
     """
 
     points: Float[Tensor, "m 3"]
