@@ -154,7 +154,7 @@ def test_bad_entries_and_names_cost_their_objects_alone(tmp_path: Path):
     write(tmp_path / "objects", {str(outside): GOOD, "../outside": GOOD, "loose": {"views": 5}, "torn": GOOD})
     scores = list(evaluate(tmp_path / "objects", load_hand("barrett"), spec=EvaluationSpec(1, starts=5)))
     assert [score.refusal for score in scores] == [Status.BAD_OBJECT] * 4
-    assert all(score.note.startswith(("objects: found", "mesh: found")) for score in scores)
+    assert all(score.note.startswith(("objects: expected", "mesh: expected")) for score in scores)
     assert sum(math.isnan(score.seconds) for score in scores) == 3  # the fourth was looked at
     assert precious.read_text() == "precious" and not list(outside.glob("*.safetensors"))
 
