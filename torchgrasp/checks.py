@@ -155,14 +155,15 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
     return value
 
 
-def _read_number(name: str, value: Any, kind: type, allowed: Range | None) -> Any:
+def _read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
     """Return a number in a range, or a truth value, as Python's own."""
     if kind is bool:
         good = isinstance(value, bool | np.bool_)
     else:
         good = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
     if good and allowed is not None:  # huge whole numbers are compared as they are
-        good = allowed.low <= value <= allowed.high and (abs(value) <= MOST or isinstance(value, float))
+        x: Any = value
+        good = allowed.low <= x <= allowed.high and (abs(x) <= MOST or isinstance(x, float))
     if not good:
         raise BadArgument(name, show(value), describe(Annotated[kind, allowed] if allowed else kind))
     return kind(value)

@@ -2,8 +2,8 @@
 
 DexGraspBench's .npy is a pickle, which could run code when it is read, so it is refused. Convert a file that you trust:
 
-    content = np.load("0.npy", allow_pickle=True).item()
-    np.savez("0.npz", grasp_qpos=content["grasp_qpos"], pregrasp_qpos=content["pregrasp_qpos"])
+    content = numpy.load("0.npy", allow_pickle=1).item()
+    numpy.savez("0.npz", grasp_qpos=content["grasp_qpos"], pregrasp_qpos=content["pregrasp_qpos"])
 """
 
 import zipfile

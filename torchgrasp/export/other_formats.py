@@ -1,6 +1,6 @@
 """Files for other programs: grasps for DexGraspBench's evaluator and GraspGen's loader, and the surface as a mesh.
 
-DexGraspBench reads each grasp by `np.load(file, allow_pickle=True).item()`. The format exists only as a pickle, and
+DexGraspBench reads each grasp by NumPy's `load` with pickles allowed. The format exists only as a pickle, and
 `save_dexgraspbench` is the one function of torchgrasp that writes one. No function of torchgrasp reads a pickle.
 
 Facts: https://github.com/JYChen18/DexGraspBench (README and src/util/hand_util.py) and

@@ -120,7 +120,8 @@ class SelfCollision(Value):
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding, distance)
-        return shapes, apart, *torch.nonzero(apart < below, as_tuple=True)
+        pair, row = torch.nonzero(apart < below, as_tuple=True)
+        return shapes, apart, pair, row
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
         """Return the distance between the centres of each pair."""

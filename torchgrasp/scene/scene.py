@@ -85,7 +85,8 @@ class Scene(Value):
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")
         image = read_image(depth, intrinsics, camera_pose)
-        inside = None if mask is None else read_depth(depth, intrinsics, mask)[2].cpu()
+        inside = None if mask is None else read_depth(depth, intrinsics, mask)[2]
+        inside = None if inside is None else inside.cpu()
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points, measured = image.points(), image.depth > 0
         plane = find_table(points[measured], image.obj_from_camera[:3, 3], table, up)
