@@ -23,7 +23,7 @@ from paper.table3 import table3
 from paper.table4_fig5 import fig5, table4
 from paper.table5_fig7_fig8 import fig7, fig8, table5
 from paper.tables6_7 import table6, table7
-from paper.whole.run import reproduce_all
+from paper.whole import reproduce_all
 
 if __name__ == "__main__":
     commands = {"all": reproduce_all, "table3": table3, "fig4": fig4, "table4": table4, "fig5": fig5}

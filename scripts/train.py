@@ -9,7 +9,6 @@ python scripts/train.py occupancy DIR                             how likely hid
 python scripts/train.py bands DIR                                 how far off hidden sides are
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
 python scripts/train.py golden                                    grasps with known verdicts, for torchgrasp selftest
-python scripts/train.py hands                                     LEAP, Shadow and left hands from tables and mirrors
 """
 
 import sys
@@ -18,7 +17,6 @@ import tyro
 from train.author_objects import objects, scene
 from train.bands import bands
 from train.golden import golden
-from train.hands.author import hands
 from train.occupancy import occupancy
 from train.stability import stability
 from train.success import success
@@ -34,7 +32,6 @@ if __name__ == "__main__":
         "objects": objects,
         "scene": scene,
         "golden": golden,
-        "hands": hands,
     }
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")

@@ -1,11 +1,17 @@
-"""What every benchmark needs: a clock, rows with a bar, the peak of memory, and random views of simple bodies."""
+"""What every benchmark needs: options, a registry, rows with a target, results as files, a clock and random views."""
 
 import dataclasses
+import importlib
 import json
+import os
+import pkgutil
+import platform
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,10 +19,58 @@ from torch import Tensor
 from torchgrasp.files import write_file
 from torchgrasp.geometry.linalg import unit
 
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of all benches; a bench uses those that it needs.
+
+    Args:
+        only: benches of the subject; by default all.
+        objects: folders with manifest.json and a folder for each object. Benches that need objects are left out
+            without one.
+        names: objects to keep; by default all.
+        views: names of the views that are measured, as view0; by default all.
+        hands: names of hands.
+        conditions: of close/misplaced and close/sensors, or perturbations of close/perturb; by default all.
+        laws: controllers of close/misplaced; by default all.
+        grasps: grasps of each view, the best or spread over all ranks.
+        starts: random starts of the contact planner.
+        scale: factor of the numbers of random samples, scenes, frames, plans and trials.
+        simulator: of load/trials.
+        workers: processes that share the trials.
+        threads: of torch.
+        seed: of every random number.
+        out: folder of the results as JSON, of kept plans and trials, and of the tables.
+        publish: write the tables to docs/results instead.
+    """
+
+    only: tuple[str, ...] = ()
+    objects: tuple[Path, ...] = ()
+    names: tuple[str, ...] = ()
+    views: tuple[str, ...] = ()
+    hands: tuple[str, ...] = ("allegro", "barrett")
+    conditions: tuple[str, ...] = ()
+    laws: tuple[str, ...] = ()
+    grasps: int = 1
+    starts: int = 1000
+    scale: float = 1.0
+    simulator: Literal["sapien", "mujoco"] = "sapien"
+    workers: int = 1
+    threads: int = 1
+    seed: int = 0
+    out: Path = Path("out")
+    publish: bool = False
+
+    def times(self, number: int) -> int:
+        """Return a number of samples times the scale, at least 1."""
+        return max(1, round(number * self.scale))
+
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One measured number beside its bar; `met` is None where there is none to meet, or nothing was measured."""
+    """One measured number beside its target; `met` is None without a target or a measurement."""
 
     what: str
     bar: str
@@ -27,6 +81,82 @@ class Row:
     def __str__(self) -> str:
         verdict = {True: "met", False: "MISSED", None: "-"}[self.met]
         return f"{verdict:7} {self.what}\n        bar {self.bar}\n        is  {self.measured}"
+
+
+class Bench(NamedTuple):
+    """A function of options that returns rows, and whether it needs folders of objects."""
+
+    run: Callable[[Options], list[Row]]
+    objects: bool
+
+
+BENCHES: dict[str, Bench] = {}
+"""All benches by name, as "close/misplaced"."""
+
+
+def bench(name: str, objects: bool = False) -> Callable[[Callable[[Options], list[Row]]], Callable]:
+    """Register a function as a bench."""
+
+    def register(run: Callable[[Options], list[Row]]) -> Callable:
+        BENCHES[name] = Bench(run, objects)
+        return run
+
+    return register
+
+
+def benches_of(subject: str) -> dict[str, Bench]:
+    """Return the benches of a subject by their short names."""
+    package = importlib.import_module(f"benchmarks.{subject}")
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"benchmarks.{subject}.{module.name}")
+    return {name.split("/")[1]: x for name, x in BENCHES.items() if name.startswith(f"{subject}/")}
+
+
+def measure(subject: str, options: Options) -> list[Row]:
+    """Run the benches that are asked for, print their rows, and write them as JSON and as Markdown."""
+    known = benches_of(subject)
+    if unknown := sorted(set(options.only) - set(known)):
+        raise SystemExit(f"only: {unknown} unknown; the benches of {subject} are {', '.join(known)}")
+    torch.set_num_threads(options.threads)
+    found: list[Row] = []
+    for name in options.only or known:
+        if known[name].objects and not options.objects:
+            print(f"{subject}/{name} needs --objects")
+            continue
+        rows = known[name].run(options)
+        print(*rows, sep="\n", flush=True)
+        write_table(ROOT / "docs" / "results" if options.publish else options.out, f"{subject}-{name}", rows, options)
+        found += rows
+    met, missed = (sum(row.met is verdict for row in found) for verdict in (True, False))
+    print(f"{met} targets met, {missed} missed, {len(found) - met - missed} rows without a target")
+    content = {"bench": subject, "settings": dataclasses.asdict(options), "rows": list(map(dataclasses.asdict, found))}
+    write_file(options.out / f"bench_{subject}.json", json.dumps(content, indent=1, default=str))
+    return found
+
+
+def write_table(folder: Path, name: str, rows: list[Row], options: Options) -> None:
+    """Write rows as a Markdown table with commit, machine and command."""
+    command = " ".join(["scripts/bench.py", *sys.argv[1:]])
+    lines = [f"# {name}", "", f"`{command}`", "", describe_run(options.threads), ""]
+    lines += ["| what | target | measured | met |", "| --- | --- | --- | --- |"]
+    for row in rows:
+        cells = row.what, row.bar, row.measured, {True: "yes", False: "no", None: "-"}[row.met]
+        lines.append(f"| {' | '.join(x.replace('|', '/') for x in cells)} |")
+    write_file(folder / f"{name}.md", "\n".join(lines) + "\n")
+
+
+def describe_run(threads: int) -> str:
+    """Return commit, processor, threads and version of torch in one line."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+
+    commit = (git("rev-parse", "--short", "HEAD") or "unknown") + (" with changes" if git("status", "--short") else "")
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    processor = names[0] if names else platform.processor() or platform.machine()
+    return f"Commit {commit}; {processor}, {os.cpu_count()} cores; {threads} threads; torch {torch.__version__}."
 
 
 def least_seconds(action: Callable[[], object], repeats: int = 5, limit: float = 5.0) -> float:
@@ -53,35 +183,6 @@ def peak_mib() -> float | None:
         return None
     line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024
-
-
-def measure(
-    bench: str,
-    subjects: Mapping[str, Callable[[], list[Row]]],
-    only: Sequence[str],
-    settings: dict[str, Any],
-    out: Path,
-) -> None:
-    """Measure the subjects asked for, print their rows as they are there, and write all of them as JSON."""
-    unknown = sorted(set(only) - set(subjects))
-    if unknown:
-        raise SystemExit(f"only: {unknown} are no subjects; {', '.join(subjects)} are")
-    print(", ".join(f"{name} {value}" for name, value in settings.items()))
-    rows: list[Row] = []
-    for name, subject in subjects.items():
-        if name in only:
-            found = subject()
-            print(*found, sep="\n", flush=True)
-            rows += found
-    met, missed = (sum(row.met is verdict for row in rows) for verdict in (True, False))
-    print(f"{met} bars met, {missed} missed, {len(rows) - met - missed} rows without one")
-    write_rows(out, bench, settings, rows)
-
-
-def write_rows(out: Path, bench: str, settings: dict[str, Any], rows: Sequence[Row]) -> None:
-    """Write rows and settings as JSON."""
-    content = {"bench": bench, "settings": settings, "rows": [dataclasses.asdict(row) for row in rows]}
-    write_file(out, json.dumps(content, indent=1, default=str))
 
 
 BODIES = ("ellipsoid", "box", "cylinder", "torus")

@@ -29,7 +29,7 @@ def frames_of(hand: Hand, joints: torch.Tensor) -> torch.Tensor:
 
 def test_self_collision_agrees_with_exact_hulls(hand):
     pytest.importorskip("coal")
-    from benchmarks.hand.coal_reference import exact_clearance
+    from tests.hand.coal_reference import exact_clearance
 
     joints = random_joints(hand, 300)
     truth, found = exact_clearance(hand, joints), hand.self_clearance(joints).numpy()

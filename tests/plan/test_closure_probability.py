@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from benchmarks.proof.closure_reference import redrawn_closure
 
 from tests.make import HALF_BALL_RADIUS as RADIUS
 from tests.make import contacts_on
 from tests.make import half_ball as ball
+from tests.plan.closure_reference import redrawn_closure
 from torchgrasp.errors import BadArgument
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.specs import ContactSpec

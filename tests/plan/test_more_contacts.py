@@ -6,8 +6,8 @@ from fractions import Fraction
 
 import pytest
 import torch
-from benchmarks.proof.certificates import border_contacts, has_low_rank, random_contacts
-from benchmarks.proof.exact_lp import proves_margin_above, proves_margin_below, wrench_matrix
+from benchmarks.plan.certificates import border_contacts, has_low_rank, random_contacts
+from benchmarks.plan.exact_lp import proves_margin_above, proves_margin_below, wrench_matrix
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument

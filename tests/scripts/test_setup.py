@@ -83,69 +83,42 @@ def wheel(tmp_path):
     return path
 
 
-def test_a_cpu_build_is_taken_from_where_pip_looks(set_up, wheel):
+CUDA = "nvidia-cublas-cu12; platform_system == 'Linux'"
+
+
+def test_setup_takes_the_cpu_build_of_the_configured_index(set_up, wheel):
     done, installs = set_up(configured=report(wheel))
     assert done.returncode == 0, done.stderr
     assert "torch==" in installs[0] and "--index-url" not in installs[0]
     assert len(installs) == 2 and "-e .[sim,mujoco,cluster,dev,docs]" in installs[1]
+    done, installs = set_up(configured=report(wheel))  # a second run does nothing
+    assert done.returncode == 0 and installs == [] and done.stdout == ""
 
 
-def test_a_cpu_build_is_looked_for_in_the_projects_own_index(set_up, wheel):
-    done, installs = set_up(configured=report(wheel, "nvidia-cublas-cu12"), index=report(wheel))
+@pytest.mark.parametrize("more", [{}, {"gpu": True, "TORCHGRASP_CUDA": "0"}], ids=["no GPU", "asked for"])
+def test_setup_looks_for_a_cpu_build_in_its_own_index(set_up, wheel, more):
+    done, installs = set_up(configured=report(wheel, CUDA), index=report(wheel), **more)
     assert done.returncode == 0, done.stderr
-    assert f"--index-url {INDEX}" in installs[0]
-    assert "CPU build" in done.stdout and "--index-url" not in installs[1]
+    assert f"--index-url {INDEX}" in installs[0] and "--index-url" not in installs[1]
 
 
-@pytest.mark.parametrize("elsewhere", ["nothing", "cuda"])
-def test_a_cuda_build_is_taken_with_its_size_where_there_is_no_other(set_up, wheel, elsewhere):
-    cuda = report(wheel, "nvidia-cublas-cu12; platform_system == 'Linux'", "triton")
+@pytest.mark.parametrize("more", [{}, {"gpu": True}], ids=["no other build", "beside a GPU"])
+def test_setup_takes_a_cuda_build_and_reports_its_size(set_up, wheel, more):
     wheel.write_bytes(b"")
     os.truncate(wheel, 2_300_000_000)  # a sparse file: it takes no space
-    done, installs = set_up(configured=cuda, index=cuda if elsewhere == "cuda" else None)
+    done, installs = set_up(configured=report(wheel, CUDA), index=report(wheel) if more else None, **more)
     assert done.returncode == 0, done.stderr
-    assert "2.3 GB" in done.stdout
-    assert "torch==" in installs[0] and "--index-url" not in installs[0]
-
-
-def test_beside_a_gpu_the_cuda_build_is_taken_and_its_size_told(set_up, wheel):
-    wheel.write_bytes(b"")
-    os.truncate(wheel, 2_300_000_000)
-    given = {"configured": report(wheel, "triton"), "index": report(wheel), "gpu": True}
-    done, installs = set_up(**given)
-    assert done.returncode == 0, done.stderr
-    assert "2.3 GB" in done.stdout and "TORCHGRASP_CUDA=0" in done.stdout and "--index-url" not in installs[0]
-
-
-def test_a_cpu_build_can_be_asked_for_beside_a_gpu(set_up, wheel):
-    given = {"configured": report(wheel, "triton"), "index": report(wheel), "gpu": True}
-    done, installs = set_up(TORCHGRASP_CUDA="0", **given)
-    assert done.returncode == 0, done.stderr
-    assert f"--index-url {INDEX}" in installs[0]
-
-
-def test_a_size_that_cannot_be_known_does_not_stop_the_set_up(set_up, wheel):
-    cuda = report(wheel, "nvidia-cublas-cu12")
-    wheel.unlink()
-    done, installs = set_up(configured=cuda)
-    assert done.returncode == 0, done.stderr
-    assert "several GB" in done.stdout and "torch==" in installs[0]
+    assert "2.3 GB" in done.stdout and "--index-url" not in installs[0]
 
 
 @pytest.mark.parametrize("given", [{"installed": True}, {"TORCHGRASP_CUDA": "1"}], ids=["installed", "asked for"])
-def test_a_torch_that_is_installed_or_asked_for_is_not_questioned(set_up, wheel, given):
-    done, installs = set_up(configured=report(wheel, "nvidia-cublas-cu12"), index=report(wheel), **given)
+def test_setup_accepts_a_torch_that_is_installed_or_asked_for(set_up, wheel, given):
+    done, installs = set_up(configured=report(wheel, CUDA), index=report(wheel), **given)
     assert done.returncode == 0, done.stderr
     assert "--index-url" not in installs[0] and "CUDA" not in done.stdout
 
 
-def test_no_torch_at_all_is_named(set_up):
+def test_setup_names_a_missing_torch(set_up):
     done, installs = set_up()
     assert done.returncode == 1 and installs == []
     assert "pip finds no torch==" in done.stderr
-
-
-def test_a_second_run_does_nothing(set_up, wheel):
-    assert len(set_up(configured=report(wheel))[1]) == 2
-    done, installs = set_up(configured=report(wheel))
-    assert done.returncode == 0 and installs == [] and done.stdout == ""

@@ -21,8 +21,8 @@ from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 from scipy.optimize import linprog
 from torch import Tensor
 
-from benchmarks.close.household import HOUSEHOLD, plan_view, read_solid
-from benchmarks.common import Row
+from benchmarks.close.household import HOUSEHOLD, plan_view, read_solid, table_spec
+from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import household_mass
 from torchgrasp.closure import ClosureResult
 from torchgrasp.control.observation import joint_jacobian
@@ -55,9 +55,10 @@ HOLD_TIME = 4.0
 """Time [s] after the lift: forces have fallen to what suffices."""
 
 
-def bench_holding(spec: TableSpec) -> list[Row]:
+@bench("close/holding", objects=True)
+def holding(o: Options) -> list[Row]:
     """Lift every object with every holding and friction."""
-    rows: list[Row] = []
+    spec, rows = table_spec(o), list[Row]()
     for hand in spec.hands:
         tasks = [(spec, subject, hand) for subject in subjects(spec)]
         lifts: list[dict[str, Any]] = []

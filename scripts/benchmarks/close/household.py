@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import (
     PERTURBATIONS,
     Perturbation,
@@ -87,6 +87,26 @@ class Lift:
     def held(self) -> bool:
         """Tell whether it held."""
         return self.status == Status.OK.name
+
+
+def table_spec(o: Options) -> TableSpec:
+    """Return the campaign of lifts that some options ask for, of one object of each family."""
+    return TableSpec(
+        o.out, o.objects, hands=o.hands, only=o.names, own=False, representatives=True, grasps=o.grasps,
+        starts=o.starts, workers=o.workers, seed=o.seed,
+    )  # fmt: skip
+
+
+@bench("close/perturb", objects=True)
+def perturb(o: Options) -> list[Row]:
+    """Lift under each household perturbation, or some of them."""
+    return bench_household(table_spec(o), o.conditions)
+
+
+@bench("close/grip", objects=True)
+def grip(o: Options) -> list[Row]:
+    """Lift under all household perturbations with several grips."""
+    return bench_grip(table_spec(o))
 
 
 def bench_household(spec: TableSpec, only: Sequence[str] = ()) -> list[Row]:

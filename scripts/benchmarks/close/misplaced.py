@@ -18,15 +18,27 @@ from typing import Any
 import torch
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
-from benchmarks.close.ablation import median_over, swap_deviations
-from benchmarks.close.conditions import BARS, CONDITIONS, DEFAULT, FRAGILE, IN_MUJOCO, LAWS, SENSED, Condition, Law
-from benchmarks.close.drawn import draw_solid
-from benchmarks.close.simulator_agreement import Verdicts, agreement_row
-from benchmarks.common import Row
+from benchmarks.close.agreement import Verdicts, agreement_row
+from benchmarks.close.conditions import (
+    BARS,
+    CONDITIONS,
+    DEFAULT,
+    FRAGILE,
+    IN_MUJOCO,
+    LAWS,
+    LAWS_OF_SENSORS,
+    SENSED,
+    Condition,
+    Law,
+    draw_solid,
+    swap_deviations,
+)
+from benchmarks.close.household import read_solid, table_spec
+from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import PERTURBATIONS, household_mass, perturb_trial
 from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand, plan_grasps
 from torchgrasp.closure import SensorModel
-from torchgrasp.data import list_views, read_mass, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_mass, read_view
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import (
     PROTOCOLS,
@@ -86,6 +98,18 @@ class Outcome:
     def held(self) -> bool:
         """Tell whether it held."""
         return self.status == Status.OK.name
+
+
+@bench("close/misplaced", objects=True)
+def misplaced(o: Options) -> list[Row]:
+    """Close on misplaced objects with every controller."""
+    return bench_misplaced(table_spec(o), o.conditions, o.laws)
+
+
+@bench("close/sensors", objects=True)
+def sensors(o: Options) -> list[Row]:
+    """Close on misplaced objects with poorer tactile sensors."""
+    return bench_misplaced(table_spec(o), o.conditions, o.laws or LAWS_OF_SENSORS)
 
 
 def bench_misplaced(spec: TableSpec, conditions: Sequence[str] = (), laws: Sequence[str] = ()) -> list[Row]:
@@ -166,6 +190,18 @@ def _moved_less(base: Sequence[Outcome], mine: Sequence[Outcome]) -> tuple[float
     return median_over([(family, own - other) for family, own, other in pairs if own is not None and other is not None])
 
 
+def median_over(values: Sequence[tuple[str, float]], seed: int = 0) -> tuple[float, float, float]:
+    """Return the median of the families' medians and its 95 % interval over families; NaN values do not count."""
+    known = [(family, value) for family, value in values if not math.isnan(value)]
+    families = sorted({family for family, _ in known})
+    if not families:
+        return math.nan, math.nan, math.nan
+    medians = torch.tensor([statistics.median(v for f, v in known if f == family) for family in families]).double()
+    drawn = torch.randint(len(families), (10_000, len(families)), generator=torch.Generator().manual_seed(seed))
+    low, high = medians[drawn].quantile(0.5, dim=1).quantile(torch.tensor([0.025, 0.975]).double()).tolist()
+    return float(medians.quantile(0.5)), low, high
+
+
 def _held(outcomes: Iterable[Outcome]) -> dict[str, tuple[int, int]]:
     """Return the counts of what held by family."""
     return count_by((x.family, x.held) for x in outcomes)
@@ -196,7 +232,7 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
     except GraspError as error:
         print(f"{subject.name}, {hand}: {error}", flush=True)
         return
-    mesh, parts = _read_solid(folder, subject.name)
+    mesh, parts = read_solid(folder, subject.name)
     mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
     shape, surface = _fit(folder, subject.name, view)
     for rank in choose_rows(len(grasps), spec.grasps, "spread"):
@@ -282,10 +318,3 @@ def _fit(folder: Path, name: str, view: str) -> tuple[ShapeGP, SignedDistanceFie
     """Return the shape of a view, and its surface as touches are compared with it."""
     shape = fit_shape(read_view(folder, name, view), table=0.0)
     return shape, surface_field(shape)
-
-
-@functools.lru_cache(maxsize=2)
-def _read_solid(folder: Path, name: str) -> tuple[Any, Any]:
-    """Return mesh and convex parts."""
-    mesh = read_object_mesh(folder, name)
-    return mesh, convex_parts(mesh)

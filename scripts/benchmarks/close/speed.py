@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
-from benchmarks.common import Row, least_seconds
+from benchmarks.common import Options, Row, bench, least_seconds
 from torchgrasp import ContactSpec, TrialSpec, close_hand, fit_shape, load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.control import GraspController, Observation
 from torchgrasp.data.shipped import GraspObject
@@ -39,15 +39,16 @@ STEPPING = 1200.0
 """Longest time [s] in which steps are timed."""
 
 
-def bench_closing_speed() -> list[Row]:
+@bench("close/speed")
+def speed(o: Options) -> list[Row]:
     """Time trials on the jug of the library with both hands, steps of the controller, and two processes beside one."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("allegro", "barrett"):
+        for name in o.hands:
             path = Path(folder) / f"{name}.safetensors"
             plan_grasps(load_object("jug").view, load_hand(name), ContactSpec(table=0.0), 100)[0].save(path)
-            rows += [_trial_row(name, path), _step_row(name, path)]
-        rows.append(_pool_row(Path(folder) / "allegro.safetensors"))
+            rows += [_trial_row(name, path), _step_row(name, path, o.times(STEPS))]
+        rows.append(_pool_row(o.hands[0], Path(folder) / f"{o.hands[0]}.safetensors", o.times(TASKS)))
     return rows
 
 
@@ -78,16 +79,16 @@ def _trial_row(name: str, path: Path) -> Row:
     )
 
 
-def _step_row(name: str, path: Path) -> Row:
+def _step_row(name: str, path: Path, steps: int) -> Row:
     """Return the row of a step, timed in a process of its own: a process reads `ALLOCATOR` when it starts."""
     with mock.patch.dict(os.environ, ALLOCATOR):
-        (found,) = run_tasks(time_steps, [(name, str(path))], 1, STEPPING)
+        (found,) = run_tasks(time_steps, [(name, str(path), steps)], 1, STEPPING)
     if isinstance(found, Status):
         raise SystemExit(f"steps of the {name} hand: {found.sentence}")
     return found
 
 
-def time_steps(name: str, path: str) -> Row:
+def time_steps(name: str, path: str, steps: int) -> Row:
     """Return the time of one step of the controller, by the processor's clock: of a trial's ticks, again and again.
 
     A loop of plain arithmetic, as long as the median step, has a worst of its own on the same computer. The median of
@@ -101,7 +102,7 @@ def time_steps(name: str, path: str) -> Row:
     collection = _seconds(gc.collect)
     gc.freeze()  # as docs/closing.md tells who drives a robot: else such a collection falls into some tick
     trials = []
-    while len(trials) * len(ticks) < STEPS:
+    while len(trials) * len(ticks) < steps:
         controller = GraspController(driver.reference, holding="grip")
         trials.append([_seconds(functools.partial(controller.step, seen, 1 / 100)) for seen in ticks])
     gc.unfreeze()
@@ -150,14 +151,14 @@ def _ticks(driver: TrialDriver) -> list[Observation]:
     return seen
 
 
-def _pool_row(path: Path) -> Row:
+def _pool_row(hand: str, path: Path, count: int) -> Row:
     """Return how much sooner two processes are done with the same trials, by the wall's clock."""
     walls = []
     for workers in (1, 2):
         began = time.perf_counter()
-        tasks = [("allegro", str(path), seed) for seed in range(TASKS)]
+        tasks = [(hand, str(path), seed) for seed in range(count)]
         list(run_tasks(close_once, tasks, workers, 600.0))
         walls.append(time.perf_counter() - began)
     ratio = walls[0] / walls[1]
-    measured = f"{ratio:.2f}x ({TASKS} trials, start of the processes included)"
+    measured = f"{ratio:.2f}x ({count} trials, start of the processes included)"
     return Row("two processes against one", ">= 1.7x on an idle machine", measured, ratio >= 1.7, {"ratio": ratio})

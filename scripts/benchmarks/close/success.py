@@ -12,7 +12,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from torchgrasp.data import list_views, read_family, read_object_mesh, read_view
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import calibration
@@ -96,9 +96,11 @@ def beside_plan(trials: Trials) -> np.ndarray:
     return np.char.startswith(trials.test, "pose-noise")
 
 
-def bench_success(objects: Path, hands: tuple[str, ...], grasps: int, workers: int, folder: Path) -> list[Row]:
+@bench("close/success", objects=True)
+def success(o: Options) -> list[Row]:
     """Judge the shipped model on the objects of a folder, none of which it was fitted on."""
-    trials, rows = read_trials(objects, hands, grasps, workers, folder), []
+    hands, folder = o.hands, o.out / "success"
+    trials, rows = read_trials(o.objects[0], hands, o.grasps, o.workers, folder), []
     predicted = SuccessModel.shipped().predict(trials)
     for hand in hands:
         mine = trials.hand == hand

@@ -1,4 +1,4 @@
-"""One kernel on two devices: times, memory, and by how much the results differ."""
+"""Every kernel of the chain on a GPU beside the CPU: times, memory, and by how much the results differ."""
 
 import dataclasses
 import statistics
@@ -9,10 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.common import Options, Row, bench
 from torchgrasp.base import Value, named_tensors
-
-LONG, FEW, MANY = 2.0, 1, 5
-"""A first call longer than this [s] is followed by `FEW` counted ones, others by `MANY`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +37,35 @@ class Timing:
     gpu: float
     peak_mib: float
     error: float
+
+
+@bench("gpu/kernels")
+def measure_kernels(o: Options) -> list[Row]:
+    """Time every kernel on the GPU and on the CPU, medians after a warm-up; nothing without a GPU."""
+    if not torch.cuda.is_available():
+        print("no GPU here")
+        return []
+    from benchmarks.gpu.kernels import kernels
+
+    device = torch.device("cuda", torch.cuda.current_device())
+    return [bench_kernel(kernel, device, (1, 8)) for kernel in kernels(o.scale < 1)]
+
+
+def bench_kernel(kernel: Kernel, device: torch.device, threads: Sequence[int]) -> Row:
+    """Return the row of one kernel: met where the results of all sizes agree."""
+    timings = [compare(kernel, size, device, threads) for size in kernel.sizes]
+    faster = {count: overtakes(timings, count) for count in threads}
+    lines = []
+    for t in timings:
+        times = ", ".join(f"{count} threads {1e3 * s:.3g} ms" for count, s in t.cpu.items())
+        lines.append(f"{t.size}: {times}, GPU {1e3 * t.gpu:.3g} ms, {t.peak_mib:.0f} MiB, error {t.error:.1e}")
+    return Row(
+        f"{kernel.name} by {kernel.what}; the GPU is faster from {', '.join(map(str, faster.values()))} on",
+        f"results differ by at most {kernel.tolerance:g}",
+        "; ".join(lines),
+        all(timing.error <= kernel.tolerance for timing in timings),
+        {"what": kernel.what, "timings": [vars(t) for t in timings], "faster_from": faster},
+    )
 
 
 def tensors_of(value: Any) -> Iterator[Tensor]:
@@ -72,14 +99,14 @@ def relative_error(one: Any, other: Any) -> float:
 def median_seconds(action: Callable[[], object], wait: Callable[[], None]) -> float:
     """Return the median wall time of an action [s], after one that is not counted; `wait` ends each."""
     times: list[float] = []
-    count = MANY
+    count = 5
     while len(times) <= count:
         began = time.perf_counter()
         action()
         wait()
         times.append(time.perf_counter() - began)
-        if len(times) == 1 and times[0] > LONG:
-            count = FEW
+        if len(times) == 1 and times[0] > 2.0:
+            count = 1
     return statistics.median(times[1:])
 
 

@@ -19,7 +19,7 @@ import pytorch_kinematics
 import torch
 from torch import Tensor
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from torchgrasp import load_hand
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import chain_from_urdf
@@ -38,9 +38,10 @@ ROWS_PER_CALL = 5000
 """Rows of one timed call."""
 
 
-def bench_fk(n: int, threads: int) -> list[Row]:
+@bench("hand/fk")
+def fk(o: Options) -> list[Row]:
     """Compare poses with pytorch-kinematics and pinocchio, and times with pytorch-kinematics."""
-    rows = []
+    n, threads, rows = o.times(1_000_000), o.threads, []
     for name in HANDS:
         hand = load_hand(name)
         rows += [_exactness(name, hand), _differentiable(name, hand)]
@@ -140,22 +141,12 @@ def _seconds(action: Callable[[Tensor], object], rows: Tensor, threads: int, rep
     return min(times[1:])
 
 
-def bench_collision(n: int, threads: int) -> list[Row]:
-    """Compare verdicts on self-collision with exact hulls, and time them."""
-    from benchmarks.hand.coal_reference import exact_clearance
-
-    rows = []
+@bench("hand/collision")
+def collision(o: Options) -> list[Row]:
+    """Time self-collision."""
+    n, threads, rows = o.times(200_000), o.threads, []
     for name in HANDS:
         hand = load_hand(name)
-        joints = random_joints(hand, max(200, n // 100), 4)
-        truth, found = exact_clearance(hand, joints), hand.self_clearance(joints).numpy()
-        met, told = truth < 0, found < 0
-        same, missed = float((met == told).mean()), float((met & ~told).mean())
-        deep = float(np.abs(found - truth)[met & told].max())
-        numbers = {"agreement": same, "missed": missed, "exact": float(met.mean()), "depth": deep}
-        is_ = f"{same:.2%}, missed {missed:.2%}; {met.mean():.1%} collide, depths differ by {1e3 * deep:.3f} mm at most"
-        title = f"{name}: self-collision against exact hulls of the URDF's shapes, {len(joints)} postures"
-        rows.append(Row(title, "agree >= 95 %, missed <= 2 %", is_, same >= 0.95 and missed <= 0.02, numbers))
         for dtype in (torch.float64, torch.float32):
             for what, below in (("distances", torch.inf), ("verdicts", 0.0)):
                 action = functools.partial(hand.self_clearance, below=below)
@@ -166,9 +157,10 @@ def bench_collision(n: int, threads: int) -> list[Row]:
     return rows
 
 
-def bench_samples(n: int, threads: int) -> list[Row]:
+@bench("hand/samples")
+def samples(o: Options) -> list[Row]:
     """Write samples by the command in another process: time, memory, and the same bytes by one worker."""
-    rows = []
+    n, threads, rows = max(100, o.times(1_000_000)), o.threads, []
     for name in HANDS:
         with tempfile.TemporaryDirectory() as folder:
             both = [Path(folder) / "one", Path(folder) / "all"]

@@ -15,10 +15,9 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from benchmarks.common import Row, least_seconds, peak_mib
+from benchmarks.common import Options, Row, bench, least_seconds, peak_mib
 from benchmarks.hand.query import touched
-from benchmarks.hand.reach import planned_postures
-from torchgrasp import load_hand, load_mixture
+from torchgrasp import Hand, Status, list_objects, load_hand, load_mixture, load_object, plan_grasps
 from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.posture_model.em import Progress, Shard, expectation, expectation_maximisation, maximisation
 from torchgrasp.posture_model.encoding import encode_fingertips
@@ -48,9 +47,11 @@ def draw(name: str, n: int, sampling: Sampling = "uniform", seed: int = 0) -> Ha
     return sample_configurations(load_hand(name), n, seed, sampling=sampling)
 
 
-def bench_em(n: int) -> list[Row]:
+@bench("hand/em")
+def em(o: Options) -> list[Row]:
     """Compare steps from the same start with scikit-learn in both precisions: time, likelihood, memory."""
-    return [row for name in COMPONENTS for row in (*_bench_steps(name, n), _bench_memory(name, n))]
+    n = o.times(400_000)
+    return [row for name in o.hands for row in (*_bench_steps(name, n), _bench_memory(name, n))]
 
 
 def _bench_steps(name: str, n: int) -> list[Row]:
@@ -160,15 +161,27 @@ def _fit_theirs(samples: HandSamples, m: int) -> None:
         GaussianMixture(m, max_iter=2, tol=0.0, random_state=0).fit(samples.rows().double().numpy())
 
 
-def bench_mae(n: int) -> list[Row]:
+def planned_postures(hand: Hand) -> HandSamples:
+    """Return postures and codes of the executable grasps on the library's own objects."""
+    joints, codes = [], []
+    for name in list_objects():
+        grasps = plan_grasps(load_object(name).view, hand)
+        good = grasps[grasps.status == Status.OK]
+        joints.append(good.joints)
+        codes.append(encode_fingertips(good.contacts.points.double(), good.contacts.normals.double()))
+    return HandSamples(torch.cat(joints), torch.cat(codes), hand.joint_names)
+
+
+@bench("hand/mae")
+def mae(o: Options) -> list[Row]:
     """Evaluate the shipped models on n / 10 postures, touching where tips roll to and with the middles of their pads.
 
     The third row has the codes that grasps really query. Beside them is the paper's own test: a model of uniform
     postures, on 6 n / 10 others. Learned postures bound any function of the code.
     """
-    rows = []
-    for name, m in COMPONENTS.items():
-        hand, mixture = load_hand(name), load_mixture(name)
+    n, rows = o.times(1_000_000), []
+    for name in o.hands:
+        m, hand, mixture = COMPONENTS[name], load_hand(name), load_mixture(name)
         learned, rolled = draw(name, n // 5, "grasping"), draw(name, n // 10, "grasping", HELD_OUT_SEED)
         middles = dataclasses.replace(rolled, q=encode_fingertips(*hand.fingertips(rolled.joints)))
         uniform, others = draw(name, 2 * n // 5), draw(name, 3 * n // 5, seed=HELD_OUT_SEED)
@@ -219,10 +232,11 @@ def _floor_row(what: str, learned: HandSamples, held_out: HandSamples, queries: 
     )
 
 
-def bench_queries(codes: int) -> list[Row]:
+@bench("hand/queries")
+def queries(o: Options) -> list[Row]:
     """Query all six assignments of held-out contacts (Eqs. 21-24), one seed each."""
-    rows = []
-    for name in COMPONENTS:
+    codes, rows = o.times(100_000), []
+    for name in o.hands:
         hand, mixture = load_hand(name), load_mixture(name)
         held_out = sample_configurations(hand, codes, HELD_OUT_SEED)
         contacts = touched(hand, held_out.joints)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from torchgrasp import Contacts, load_hand, load_mixture
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
@@ -39,14 +39,15 @@ MEDIAN, RATIO = 0.05, 50.0
 Result = TypeVar("Result")
 
 
-def bench_codes(codes: int, peers: int) -> list[Row]:
+@bench("hand/codes")
+def codes(o: Options) -> list[Row]:
     """Solve held-out codes of both hands, and some of them with COBYLA from the likeliest seed.
 
     Args:
         codes: of each hand.
         peers: how many of them COBYLA gets.
     """
-    return [row for name in BARS for row in _bench_hand(name, codes, peers)]
+    return [row for name in o.hands for row in _bench_hand(name, o.times(10_000), o.times(100))]
 
 
 def _bench_hand(name: str, codes: int, peers: int) -> list[Row]:

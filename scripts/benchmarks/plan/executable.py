@@ -7,13 +7,12 @@ processor's time of planning, certificates, seeds and solving; the shape and its
 """
 
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
 from tqdm import tqdm
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from benchmarks.ground_truth import read_views
 from torchgrasp import ContactSpec, Grasps, Hand, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
 from torchgrasp.geometry.frames import apply
@@ -129,9 +128,10 @@ def _row(hand: str, mode: str, objects: dict[str, dict[str, Any]], starts: int) 
     )
 
 
-def bench_planned(objects: Path, starts: int, seed: int) -> list[Row]:
+@bench("plan/executable", objects=True)
+def executable(o: Options) -> list[Row]:
     """Print what became of certified triples by object, hand and mode, and return the rows of the means."""
-    rows = bench_executable(list(read_views(objects)), starts, seed)
+    rows = bench_executable(list(read_views(o.objects[0], views=o.views)), o.starts, o.seed)
     for row in rows:
         print(format_blockers(row.numbers["hand"], row.numbers["mode"], row.numbers["objects"]), flush=True)
     return rows

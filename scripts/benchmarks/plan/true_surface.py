@@ -6,8 +6,8 @@ from typing import Any
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.common import Row
-from benchmarks.ground_truth import nearest_on_mesh
+from benchmarks.common import Options, Row, bench
+from benchmarks.ground_truth import nearest_on_mesh, read_views
 from torchgrasp import ContactSpec, Status, fit_shape, plan_contacts
 from torchgrasp.plan.closure import closed_exact
 from torchgrasp.shape.gp import ShapeGP
@@ -33,8 +33,10 @@ CHANGED = {
 }
 
 
-def bench_truth(views: list[Any], starts: int, seed: int) -> Row:
+@bench("plan/truth", objects=True)
+def truth(o: Options) -> list[Row]:
     """Compare the default specification and shape with the paper's, on every view."""
+    views, starts, seed = list(read_views(o.objects[0], views=o.views)), o.starts, o.seed
     held: dict[str, dict[str, float]] = {"default": {}, "paper": {}}
     okay: dict[str, list[float]] = {name: [] for name in held}
     for name, view, cloud, mesh in tqdm(views, desc="truth", disable=None, leave=False):
@@ -49,7 +51,7 @@ def bench_truth(views: list[Any], starts: int, seed: int) -> Row:
     mean = {label: sum(s.values()) / len(s) for label, s in held.items()}
     lowest = sorted(held["default"].items(), key=lambda item: item[1])[:4]
     done = {label: sum(values) / len(values) for label, values in okay.items()}
-    return Row(
+    row = Row(
         f"certified grasps closed on the true surface at friction {FRICTION}, {len(views)} views, mean over views",
         ">= 0.80 with the default specification",
         f"{mean['default']:.2f} (paper's specification on the paper's shape {mean['paper']:.2f}); least "
@@ -58,10 +60,13 @@ def bench_truth(views: list[Any], starts: int, seed: int) -> Row:
         mean["default"] >= 0.8,
         {"shares": held, "certified": okay},
     )
+    return [row]
 
 
-def bench_fields(views: list[Any], starts: int, seed: int) -> Row:
+@bench("plan/fields", objects=True)
+def fields(o: Options) -> list[Row]:
     """Change one field of the default specification at a time."""
+    views, starts, seed = list(read_views(o.objects[0], views=o.views)), max(o.starts // 5, 1), o.seed
     results: dict[str, list[tuple[float, float]]] = {"default": [], **{name: [] for name in CHANGED}}
     for _, _, cloud, mesh in tqdm(views, desc="fields", disable=None, leave=False):
         shape = fit_shape(cloud, table=0.0)
@@ -72,13 +77,14 @@ def bench_fields(views: list[Any], starts: int, seed: int) -> Row:
     mean = {
         label: [sum(column) / len(column) for column in zip(*pairs, strict=True)] for label, pairs in results.items()
     }
-    return Row(
+    row = Row(
         f"one field of the specification changed: certified of the starts, and of these closed at friction {FRICTION}",
         "none",
         "; ".join(f"{label} {share:.0%} {survived:.3f}" for label, (share, survived) in mean.items()),
         None,
         {"found": results},
     )
+    return [row]
 
 
 def survive(shape: ShapeGP, spec: ContactSpec, mesh: Any, starts: int, seed: int) -> tuple[float, float | None]:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from benchmarks.scene.drop import PlacedScene, aim, drop, settle
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.errors import BadArgument, Status
@@ -78,6 +78,22 @@ class SceneScore:
     plan_seconds: float = 0.0
 
 
+@bench("scene/clutter")
+def clutter(o: Options) -> list[Row]:
+    """Lift the easiest object of dropped scenes, with exact masks and with masks of 4 pixels more or less."""
+    objects = o.objects[0] if o.objects else None
+    asked = [Clutter(objects, hand, mask_error=k, starts=o.starts, seed=o.seed) for hand in o.hands for k in (0, 4, -4)]
+    return [row for one in asked for row in bench_clutter(one, o.times(20), o.workers)]
+
+
+@bench("scene/clear")
+def clear(o: Options) -> list[Row]:
+    """Lift all objects of dropped scenes, one after another."""
+    objects = o.objects[0] if o.objects else None
+    asked = [Clutter(objects, hand, clear=True, starts=o.starts, seed=o.seed) for hand in o.hands]
+    return [row for one in asked for row in bench_clutter(one, o.times(20), o.workers)]
+
+
 def bench_clutter(asked: Clutter, scenes: int, workers: int) -> list[Row]:
     """Drop scenes, plan on an image of each, execute the easiest grasp, and sum up."""
     load_hand(asked.hand)
@@ -87,7 +103,7 @@ def bench_clutter(asked: Clutter, scenes: int, workers: int) -> list[Row]:
         tried = ", ".join(f"{one.name} {one.status.name.lower()}" for one in score.tries) or score.reason
         print(f"{k:5} {sum(one.status is Status.OK for one in score.tries)}/{len(score.names)} {tried}", flush=True)
         scores.append(score)
-    what = f"scenes of {asked.count[0]} to {asked.count[1]} objects, {asked.hand}"
+    what = f"scenes of {asked.count[0]} to {asked.count[1]} objects, masks {asked.mask_error:+d} px, {asked.hand}"
     numbers = summarise_scenes(scores)
     shares = {name: x for name, x in numbers.items() if isinstance(x, Share)}
     if not asked.clear:

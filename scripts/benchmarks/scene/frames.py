@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from torchgrasp import ContactSpec, close_hand, list_objects, load_hand, load_object, plan_grasps
 from torchgrasp.base import named_tensors
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
@@ -15,9 +15,11 @@ STARTS = 25
 """Starts of each plan: fewer grasps to compare cost nothing in sharpness, as all stages run."""
 
 
-def measure_frames(count: int, trials: int, seed: int = 0) -> list[Row]:
-    """Return the largest differences of grasps in `count` frames, and of closings in `trials` of them."""
-    generator, hand = torch.Generator().manual_seed(seed), load_hand("allegro")
+@bench("scene/frames")
+def frames(o: Options) -> list[Row]:
+    """Return the largest differences of grasps in random frames, and of closings in some of them."""
+    count, trials = o.times(200), o.times(20)
+    generator, hand = torch.Generator().manual_seed(o.seed), load_hand(o.hands[0])
     grasp_error = trial_error = 0.0
     same = closed = done = 0
     for name in list_objects():

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from sklearn.metrics import cohen_kappa_score, confusion_matrix
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from torchgrasp import load_hand
 from torchgrasp.evaluation import EvaluationSpec, evaluate
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
@@ -44,11 +44,13 @@ Verdicts = tuple[str, bool, bool]
 """The family of an object, and whether a grasp passed in SAPIEN and in MuJoCo."""
 
 
-def bench_agreement(objects: Path, spec: EvaluationSpec, workers: int) -> list[Row]:
-    """Put grasps of all ranks of every view of every object to each test, with both hands."""
-    spec = dataclasses.replace(spec, ranks="spread")
+@bench("close/agreement", objects=True)
+def agreement(o: Options) -> list[Row]:
+    """Put grasps of all ranks of every view of every object to each test."""
+    objects, workers = o.objects[0], o.workers
+    spec = EvaluationSpec(o.grasps, "spread", o.starts, only=o.names, seed=o.seed)
     cases = []
-    for hand in (load_hand("allegro"), load_hand("barrett")):
+    for hand in map(load_hand, o.hands):
         with tempfile.TemporaryDirectory() as folder:
             planned = False
             for test in TESTS:

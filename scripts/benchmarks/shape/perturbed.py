@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks.common import Row
+from benchmarks.common import Options, Row, bench
 from benchmarks.ground_truth import read_views
 from benchmarks.perturb import PERTURBATIONS, find_perturbation, perturb_view
 from benchmarks.shape.accuracy import Row as View
@@ -25,6 +25,12 @@ COLUMNS = {
     "hidden_within_2": ("within 2 std_m", 100.0, "{:.0f} %"),
 }
 """Numbers of the hidden surface: their names, factors and formats."""
+
+
+@bench("shape/weaker", objects=True)
+def weaker(o: Options) -> list[Row]:
+    """Measure the hidden surface under the perturbations of camera and table."""
+    return bench_weaker(o.objects[0], o.views, o.seed)
 
 
 def bench_weaker(objects: Path, views: tuple[str, ...], seed: int) -> list[Row]:

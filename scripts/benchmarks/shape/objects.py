@@ -1,7 +1,7 @@
-"""The shape beside its bars: exactness, speed and memory on random views, truth on the hidden side of real objects."""
+"""The estimated shape of real objects: hidden surface, coverage, closure, walls and time."""
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -9,95 +9,21 @@ from typing import Literal
 import torch
 from tqdm import tqdm
 
-from benchmarks.common import Row, least_seconds, measure
+from benchmarks.common import Options, Row, bench, least_seconds
 from benchmarks.ground_truth import read_views
-from benchmarks.plan.closure_survival import closure_survival
 from benchmarks.shape.accuracy import Row as View
 from benchmarks.shape.accuracy import format_groups, format_table, mean_row, measure_shape
-from benchmarks.shape.exactness import bench_cholesky, bench_laws, bench_refusals, bench_selection, bench_update
-from benchmarks.shape.input_ablation import bench_inputs
-from benchmarks.shape.speed import bench_growth, bench_memory, bench_queries, bench_raw
+from benchmarks.shape.closure_survival import closure_survival
 from benchmarks.shape.walls import measure_walls
-from benchmarks.shape.weaker_inputs import bench_weaker
-from benchmarks.shape.worst_views import bench_worst
 from torchgrasp.data import read_family, read_group
 from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.shape.fit import fit_shape
 
-SUBJECTS = (
-    "refusals",
-    "selection",
-    "laws",
-    "update",
-    "queries",
-    "memory",
-    "raw",
-    "growth",
-    "objects",
-    "inputs",
-    "weaker",
-    "worst",
-    "cholesky",
-)
 
-
-def shape(
-    objects: Path | None = None,
-    only: tuple[str, ...] = SUBJECTS,
-    views: tuple[str, ...] = (),
-    clouds: int = 10_000,
-    queries: int = 100_000,
-    threads: int = 2,
-    seed: int = 0,
-    quick: bool = False,
-    out: Path = Path("out/bench_shape.json"),
-) -> None:
-    """Measure the shape against its bars and against peers, in one run and on the same threads; needs the extra bench.
-
-    Args:
-        objects: folder with manifest.json and a folder for each object; without it the hidden side is not measured.
-        only: subjects to measure: refusals, selection, laws, update, queries, memory, raw, growth, objects, inputs,
-            weaker, worst, cholesky.
-        views: names of the views of each object, such as view0; by default all.
-        clouds: random partial clouds whose covariance is factored; 10^4 take about ten minutes.
-        queries: points at which the shape is asked; ten times as many for the memory.
-        threads: of torch, for the library and its peers alike. Times are the least of some
-            calls: of the processor on one thread, which other load does not touch, of the wall on several.
-        seed: of the random clouds, and of what is wrong in weaker inputs.
-        quick: a hundredth of the clouds and a tenth of the queries.
-        out: where the numbers are written as JSON, and beside it the growth as a picture.
-    """
-    torch.set_num_threads(threads)
-    clouds, queries = (clouds // 100, queries // 10) if quick else (clouds, queries)
-    subjects: dict[str, Callable[[], list[Row]]] = {
-        "refusals": lambda: [bench_refusals()],
-        "selection": lambda: bench_selection(2 if quick else 5),
-        "laws": lambda: [bench_laws()],
-        "update": lambda: [bench_update()],
-        "queries": lambda: [*bench_queries(70, 6, queries), *bench_queries(300, 50, queries)],
-        "memory": lambda: [bench_memory(10 * queries, threads)],
-        "raw": lambda: [bench_raw(queries)],
-        "growth": lambda: [bench_growth(out.with_name("bench_shape_growth.png"))],
-        "objects": lambda: bench_objects(objects, views) if objects else [],
-        "inputs": lambda: bench_inputs(objects) if objects else [],
-        "weaker": lambda: bench_weaker(objects, views, seed) if objects else [],
-        "worst": lambda: bench_worst(objects, views, out.parent) if objects else [],
-        "cholesky": lambda: [bench_cholesky(clouds, seed)],
-    }
-    clock = "processor" if threads == 1 else "wall"
-    settings = {
-        "threads": threads,
-        "clock": clock,
-        "clouds": clouds,
-        "queries": queries,
-        "seed": seed,
-        "torch": torch.__version__,
-    }
-    measure("shape", subjects, only, settings, out)
-
-
-def bench_objects(objects: Path, only: Sequence[str]) -> list[Row]:
+@bench("shape/objects", objects=True)
+def objects(o: Options) -> list[Row]:
     """Measure surface, coverage, closure and time of the fit on noisy views of a folder, the table given."""
+    objects, only = o.objects[0], o.views
     views, papers = _measure(objects, only, "camera"), _measure(objects, only, "paper")
     seconds = _time_fits(objects, only)
     print(format_table(views), format_groups(views), sep="\n")

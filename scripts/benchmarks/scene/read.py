@@ -1,75 +1,26 @@
-"""From a depth image to its table and to a clicked thing, beside the bars."""
+"""From a depth image to its table and to the object at a clicked pixel."""
 
-import dataclasses
 import math
 import time
-from pathlib import Path
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.common import Row, measure
-from benchmarks.scene.clutter import Clutter, bench_clutter
-from benchmarks.scene.frames import measure_frames
+from benchmarks.common import Options, Row, bench
 from benchmarks.scene.scenes import Picture, read_meshes, take_picture
 from torchgrasp.cloud.camera import INTRINSICS
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene import Scene
 
-SUBJECTS = ("plane", "clicked point", "frames", "clutter", "clear")
 TABLES = ("apart", "apart", "crowded", "boxes", "close")
 """Kinds of scenes with a table, in turn."""
 EMPTY = ("lone", "lone", "apart", "boxes")
 """Kinds of scenes without a table, in turn."""
 LEAST_SEEN = 500
 """Measured pixels of an object that can be clicked: smaller ones are hidden, or too far to be grasped."""
-
-
-def scene(
-    objects: Path,
-    only: tuple[str, ...] = SUBJECTS,
-    scenes: int = 300,
-    frames: int = 200,
-    trials: int = 20,
-    hand: str = "allegro",
-    mask_error: int = 0,
-    starts: int = 1000,
-    workers: int = 1,
-    seed: int = 0,
-    out: Path = Path("out/bench_scene.json"),
-) -> None:
-    """Measure how scenes are read, that results do not depend on the frame, and lifts among neighbours.
-
-    Args:
-        objects: folder with manifest.json and a folder for each object.
-        only: subjects to measure: plane, clicked point, frames, clutter (the easiest object of dropped scenes is
-            lifted), clear (all of them, one after another).
-        scenes: rendered scenes of plane and clicked point; clutter and clear drop a tenth of them. A third of them is
-            rendered without a table.
-        frames: random frames in which grasps are planned.
-        trials: of these, frames in which the best grasp is closed in simulation.
-        hand: that lifts from clutter.
-        mask_error: pixels by which each mask in clutter is grown, or shrunk if negative.
-        starts: of the contact planner in clutter.
-        workers: processes in clutter.
-        seed: of the scenes.
-        out: where the numbers are written as JSON.
-    """
-    torch.set_num_threads(1)
-    meshes = read_meshes(objects) if set(only) & {"plane", "clicked point"} else []
-    clutter = Clutter(objects, hand, (5, 8), mask_error, starts=starts, seed=seed)
-    dropped = max(1, scenes // 10)
-    subjects = {
-        "plane": lambda: bench_plane(meshes, scenes, seed),
-        "clicked point": lambda: bench_click(meshes, scenes, seed),
-        "frames": lambda: measure_frames(frames, trials, seed),
-        "clutter": lambda: bench_clutter(clutter, dropped, workers),
-        "clear": lambda: bench_clutter(dataclasses.replace(clutter, clear=True), dropped, workers),
-    }
-    measure("scene", subjects, only, {"scenes": scenes, "seed": seed, "objects": len(meshes)}, out)
 
 
 def read_plane(picture: Picture) -> Plane | None:
@@ -81,8 +32,10 @@ def read_plane(picture: Picture) -> Plane | None:
     return None if table is None else table.moved(picture.camera_pose)
 
 
-def bench_plane(meshes: list, scenes: int, seed: int) -> list[Row]:
-    """Measure the plane of scenes with a table, and how often one is found without."""
+@bench("scene/plane", objects=True)
+def plane(o: Options) -> list[Row]:
+    """Measure the plane of scenes with a table, and how often a plane is found without a table."""
+    meshes, scenes, seed = read_meshes(o.objects[0]), o.times(300), o.seed
     errors: list[tuple[float, float]] = []
     refused = 0
     for i in tqdm(range(scenes), desc="plane", disable=None, leave=False):
@@ -138,8 +91,10 @@ def choose_pixel(picture: Picture, generator: torch.Generator) -> tuple[int, tup
     return k, (column, row)
 
 
-def bench_click(meshes: list, scenes: int, seed: int) -> list[Row]:
-    """Measure the clicked thing's points: the share that is found, and the share of others among them."""
+@bench("scene/click", objects=True)
+def click(o: Options) -> list[Row]:
+    """Measure the points of the object at a clicked pixel: the share that is found, and the share of other points."""
+    meshes, scenes, seed = read_meshes(o.objects[0]), o.times(300), o.seed
     generator = torch.Generator().manual_seed(seed)
     rows, seconds, i = [], [], 0
     progress = tqdm(total=scenes, desc="click", disable=None, leave=False)
@@ -166,8 +121,8 @@ def bench_click(meshes: list, scenes: int, seed: int) -> list[Row]:
     both = sum(s >= 0.95 and o <= 0.02 for s, o in zip(share, others, strict=True)) / scenes
     return [
         Row(
-            f"thing at a clicked pixel, {scenes} scenes of 3 to 8 objects at least 10 mm apart, mean",
-            "the right thing's points >= 95 %, of others <= 2 %",
+            f"object at a clicked pixel, {scenes} scenes of 3 to 8 objects at least 10 mm apart, mean",
+            "the right object's points >= 95 %, of others <= 2 %",
             f"{mean_share:.1%}, {mean_others:.1%}; both in {both:.0%} of the scenes",
             mean_share >= 0.95 and mean_others <= 0.02,
             {"scenes": rows},

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks.common import Row, least_seconds
-from benchmarks.proof.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
+from benchmarks.common import Options, Row, bench, least_seconds
+from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify, solve_by_highs
 from torchgrasp.plan.closure import solve_closure_lp
@@ -18,6 +18,12 @@ from torchgrasp.values import Contacts
 
 FRICTIONS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0)
 EDGES = (8, 8, 8, 8, 8, 3, 4, 5, 6, 12)
+
+
+@bench("plan/certificates")
+def certificates(o: Options) -> list[Row]:
+    """Compare certificates of 3 to 5 contacts with exact arithmetic."""
+    return [row for f in (3, 4, 5) for row in bench_certificates(f, max(o.times(100_000), 20), o.seed)]
 
 
 def bench_certificates(fingertips: int, grasps: int, seed: int) -> list[Row]:

@@ -1,18 +1,17 @@
 """From one noisy view to a held object, for every object of a folder and both hands."""
 
-import json
 import math
 import time
-from pathlib import Path
 from typing import Any
 
-import torch
 import trimesh
 
+from benchmarks.common import Options, Row, bench
 from torchgrasp import ContactSpec, PointCloud, Status, TrialSpec, close_hand, load_hand, plan_grasps
 from torchgrasp.base import count_status
 from torchgrasp.data import list_views, read_object_mesh, read_view
-from torchgrasp.files import format_line, write_file
+from torchgrasp.evaluation import EvaluationSpec, evaluate, format_share, summarise
+from torchgrasp.files import format_line
 
 
 def bench_one(
@@ -73,50 +72,40 @@ def table_line(r: dict[str, Any]) -> str:
     return format_line((r["object"], r["hand"], *numbers, best, held), list(COLUMNS.values()))
 
 
-def print_counts(rows: list[dict[str, Any]]) -> None:
-    """Print how many objects have a grasp and how many top grasps were held, for each hand."""
+def count_rows(rows: list[dict[str, Any]]) -> list[Row]:
+    """Return how many objects have a grasp and how many best grasps held, for each hand."""
+    found = []
     for hand in sorted({r["hand"] for r in rows}):
         mine = [r for r in rows if r["hand"] == hand]
-        found = sum(r["grasps"] > 0 for r in mine)
+        grasped = sum(r["grasps"] > 0 for r in mine)
         held = sum(bool(r["trials"]) and r["trials"][0]["held"] for r in mine)
         tried = [t for r in mine for t in r["trials"]]
-        all_held = f"{sum(t['held'] for t in tried)} of {len(tried)} trials held"
-        print(f"{hand}: {found} of {len(mine)} objects with a grasp, the top one held on {held}, {all_held}")
+        trials = f"{sum(t['held'] for t in tried)} of {len(tried)} trials"
+        text = f"{grasped} with a grasp, the best grasp held on {held}, {trials}"
+        found.append(Row(f"{hand}: {len(mine)} objects", "-", text, None, {"rows": mine}))
+    return found
 
 
-def grasp(
-    objects: Path,
-    hands: tuple[str, ...] = ("allegro", "barrett"),
-    only: tuple[str, ...] = (),
-    view: str = "view0",
-    starts: int = 1000,
-    seed: int = 0,
-    close: int = 1,
-    camera: bool = True,
-    out: Path = Path("out/bench_grasp.json"),
-) -> None:
-    """Plan from one noisy view of every object, for each hand, and close on the true mesh in simulation.
-
-    Args:
-        objects: folder with manifest.json and a folder for each object.
-        hands: hands to plan for.
-        only: objects to keep; all by default.
-        view: which view of each object is seen.
-        starts: starts of the contact planner.
-        seed: of every random draw.
-        close: how many of the best grasps of each object and hand are closed.
-        camera: whether the camera's position is given, as in the manifest, or must be estimated.
-        out: where the numbers are written as JSON.
-    """
-    torch.set_num_threads(1)  # the batches are small: a second thread brings nothing here
+@bench("grasp/lifts", objects=True)
+def lifts(o: Options) -> list[Row]:
+    """Plan from one noisy view of every object, for each hand, and lift the true mesh with the best grasps."""
     print(format_line(list(COLUMNS), list(COLUMNS.values())))
     rows = []
-    for name in dict.fromkeys(name for name, _ in list_views(objects, only=only)):
-        cloud, mesh = read_view(objects, name, view, camera), read_object_mesh(objects, name)
-        for hand in hands:
-            rows.append({"object": name} | bench_one(cloud, mesh, hand, starts, seed, close))
+    for name, view in list_views(o.objects[0], only=o.names, most=1):
+        cloud, mesh = read_view(o.objects[0], name, view), read_object_mesh(o.objects[0], name)
+        for hand in o.hands:
+            rows.append({"object": name} | bench_one(cloud, mesh, hand, o.starts, o.seed, o.grasps))
             print(table_line(rows[-1]), flush=True)
-    print_counts(rows)
-    threads = torch.get_num_threads()
-    text = json.dumps({"bench": "grasp", "view": view, "seed": seed, "threads": threads, "rows": rows}, indent=1)
-    write_file(out, text)
+    return count_rows(rows)
+
+
+@bench("grasp/pulls", objects=True)
+def pulls(o: Options) -> list[Row]:
+    """Pull at the best grasps of every view, as DexGraspBench does."""
+    spec, rows = EvaluationSpec(o.grasps, starts=o.starts, only=o.names, seed=o.seed), []
+    for hand in o.hands:
+        found = summarise(list(evaluate(o.objects[0], load_hand(hand), "dexgraspbench", spec, workers=o.workers)))
+        for name in ("gsr", "top1", "objects"):
+            share = found[name]
+            rows.append(Row(f"{hand}, dexgraspbench, {name}", "-", format_share(share), None, {name: share}))
+    return rows

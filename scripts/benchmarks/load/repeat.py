@@ -1,21 +1,16 @@
 """Memory, open files and threads over many plans and trials in one process; the memory of large inputs."""
 
 import gc
-import importlib
-import inspect
 import os
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.common import Row, measure, peak_mib
+from benchmarks.common import Options, Row, bench, peak_mib
 from torchgrasp import (
     ContactSpec,
     PointCloud,
@@ -30,9 +25,7 @@ from torchgrasp import (
 )
 from torchgrasp.errors import Status
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.specs import Simulator
 
-SUBJECTS = ("plans", "trials", "points", "starts", "checks")
 SPEC = ContactSpec(table=0.0)
 STARTS = 16
 """Of a plan that is repeated: one wave, since three take half as long again and hold the same things."""
@@ -46,48 +39,18 @@ GROWTH = 0.05
 """Bar: growth of the resident memory from then to the end, by a line through all readings."""
 
 
-def load(
-    only: tuple[str, ...] = SUBJECTS,
-    hand: str = "allegro",
-    plans: int = 500,
-    trials: int = 2000,
-    points: int = 2_000_000,
-    starts: int = 100_000,
-    simulator: Simulator = "sapien",
-    out: Path = Path("out/bench_load.json"),
-) -> None:
-    """Measure what a process holds after many calls, and at most within a large one. Needs /proc, as Linux has it.
-
-    Args:
-        only: subjects to measure: plans, trials, points, starts, checks.
-        hand: that grasps.
-        plans: number of plans in one process, on the shipped objects in turn.
-        trials: number of grasps closed and lifted in one process.
-        points: of one cloud.
-        starts: of one contact plan.
-        simulator: of the trials.
-        out: where the numbers are written as JSON.
-    """
-    torch.set_num_threads(1)
-    subjects = {
-        "plans": partial(_plans, hand, plans),
-        "trials": partial(_trials, hand, trials, simulator),
-        "points": partial(_points, hand, points),
-        "starts": partial(_starts, starts),
-        "checks": partial(_checks, hand),
-    }
-    settings = {"hand": hand, "plans": plans, "trials": trials, "points": points, "starts": starts}
-    measure("load", subjects, only, settings | {"simulator": simulator}, out)
-
-
-def _plans(hand: str, n: int) -> list[Row]:
-    """Plan again and again."""
+@bench("load/plans")
+def plans(o: Options) -> list[Row]:
+    """Plan again and again in one process."""
+    hand, n = o.hands[0], o.times(500)
     model, views = load_hand(hand), [load_object(name).view for name in list_objects()]
     return [_repeated("plans", n, lambda k: plan_grasps(views[k % len(views)], model, SPEC, STARTS, seed=k))]
 
 
-def _trials(hand: str, n: int, simulator: Simulator) -> list[Row]:
-    """Close and lift again and again."""
+@bench("load/trials")
+def trials(o: Options) -> list[Row]:
+    """Close and lift again and again in one process."""
+    hand, n, simulator = o.hands[0], o.times(2000), o.simulator
     model, jug = load_hand(hand), load_object("jug")
     grasps = plan_grasps(jug.view, model, SPEC, STARTS)
     grasps = grasps[grasps.status == Status.OK]
@@ -123,8 +86,10 @@ def _repeated(what: str, n: int, once: Callable[[int], object]) -> Row:
     return Row(f"{n} {what} in one process", f"at most +{GROWTH:.0%}, no file, no thread", measured, sound, numbers)
 
 
-def _points(hand: str, n: int) -> list[Row]:
+@bench("load/points")
+def points(o: Options) -> list[Row]:
     """Plan on one cloud of many points, beside one of 1 % of them."""
+    hand, n = o.hands[0], max(100_000, o.times(2_000_000))
     model, rows = load_hand(hand), []
     for count in (n // 100, n):
         cloud = _egg(count)
@@ -132,44 +97,15 @@ def _points(hand: str, n: int) -> list[Row]:
     return rows
 
 
-def _starts(n: int) -> list[Row]:
+@bench("load/starts")
+def starts(o: Options) -> list[Row]:
     """Plan contacts from many starts at once, beside 1 % of them."""
+    n = max(100, o.times(100_000))
     shape = fit_shape(load_object("jug").view, table=0.0)
     return [
         _peak(f"{count:,} starts", lambda: plan_contacts(shape, SPEC, starts=count))  # noqa: B023
         for count in (n // 100, n)
     ]
-
-
-def _checks(hand: str) -> list[Row]:
-    """Plan, and measure what reading arguments at the border takes of it: binding, reading, finite numbers."""
-    model, view, rows = load_hand(hand), load_object("jug").view, list[Row]()
-    checks = importlib.import_module("torchgrasp.checks")
-    spent = [0.0]
-
-    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*args: Any, **named: Any) -> Any:
-            began = time.process_time()
-            try:
-                return function(*args, **named)
-            finally:
-                spent[0] += time.process_time() - began
-
-        return call
-
-    plan_grasps(view, model, SPEC, STARTS)  # what is read once is read now
-    with (
-        patch.object(checks, "_read", timed(checks._read)),
-        patch.object(checks._Call, "check_numbers", timed(checks._Call.check_numbers)),
-        patch.object(inspect.Signature, "bind", timed(inspect.Signature.bind)),
-    ):
-        for starts in (100, 1000):
-            spent[0], began = 0.0, time.process_time()
-            plan_grasps(view, model, SPEC, starts)
-            share = spent[0] / (time.process_time() - began)
-            numbers = {"seconds": spent[0], "share": share}
-            rows.append(Row(f"checks in a plan of {starts} starts", "1 %", f"{share:.2%}", share <= CHECKS, numbers))
-    return rows
 
 
 def _peak(what: str, action: Callable[[], object]) -> Row:

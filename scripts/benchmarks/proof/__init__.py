@@ -1,1 +1,0 @@
-"""Certificates and probabilities against exact references."""

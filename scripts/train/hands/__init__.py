@@ -1,1 +1,0 @@
-"""The shipped hands that are written from tables: numbers of each hand, their files, mirror images."""

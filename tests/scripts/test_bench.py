@@ -1,0 +1,123 @@
+"""scripts/bench.py: each bench runs on its smallest case, and the measures agree with closed forms."""
+
+import json
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from benchmarks.close.conditions import CONDITIONS, draw_solid
+from benchmarks.close.misplaced import _misplace, median_over
+from benchmarks.common import Options, measure
+from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
+from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
+from benchmarks.shape.accuracy import find_edges, mean_row, measure_shape
+from benchmarks.shape.walls import measure_walls
+from scipy.spatial.transform import Rotation
+from tests.cups import cup, cup_view
+from torchgrasp.plan.closure import solve_closure_lp
+
+from tests.pinch import cylinder, pinch
+from torchgrasp import Contacts, ContactSpec, PointCloud, certify, fit_shape, load_object
+from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.plan.wrench import wrenches
+
+RUNS = ("gpu/kernels", "hand/collision", "load/starts", "plan/truth", "scene/plane")
+SIMULATED = ("close/perturb", "grasp/lifts")
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", [*RUNS, *(pytest.param(name, marks=pytest.mark.sim) for name in SIMULATED)])
+def test_bench_writes_its_rows(name, tin, tmp_path, capsys):
+    subject, short = name.split("/")
+    if name in SIMULATED:
+        pytest.importorskip("sapien")
+    options = Options(
+        (short,), (tin,), hands=("barrett",), conditions=("none",),
+        starts=30, scale=2e-4, workers=0, out=tmp_path / "out",
+    )  # fmt: skip
+    rows = measure(subject, options)
+    assert len(rows) > 0 or name == "gpu/kernels"
+    written = json.loads((tmp_path / "out" / f"bench_{subject}.json").read_text())
+    assert [row["what"] for row in written["rows"]] == [row.what for row in rows]
+    table = (tmp_path / "out" / f"{subject}-{short}.md").read_text()
+    assert "Commit " in table and table.count("\n| ") == len(rows) + 2
+    capsys.readouterr()
+
+
+def test_measure_refuses_an_unknown_bench():
+    with pytest.raises(SystemExit, match="unknown; the benches of scene are"):
+        measure("scene", Options(only=("nothing",)))
+
+
+def ball(radius: float, n: int) -> torch.Tensor:
+    return radius * unit(torch.randn(n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+
+
+def test_measure_shape_of_a_larger_ball_is_the_difference_of_the_radii():
+    points = ball(0.04, 2000)
+    shape, cloud = fit_shape(PointCloud(points, unit(points))), PointCloud(points)
+    row = measure_shape(shape, trimesh.creation.icosphere(subdivisions=4, radius=0.043), cloud)
+    assert row["seen_median_mm"] == pytest.approx(3.0, abs=0.2) and row["seen_normal_deg"] < 4
+    assert math.isnan(measure_shape(shape, trimesh.creation.icosphere(4, 0.04), cloud)["hidden_median_mm"])
+    assert mean_row([{"a": 1.0, "b": math.nan}, {"a": 3.0, "b": 5.0}]) == {"a": 2.0, "b": 5.0}
+
+
+def test_measure_walls_of_a_cup_finds_its_thickness():
+    cloud = cup_view(0.003)
+    row = measure_walls(fit_shape(cloud, table=0.0), cup(0.003), cloud)
+    assert abs(row["wall_mm"] - 3.0) < 0.1 and row["wall_off_mm"] < 1.5 and row["wall_holes"] < 0.03
+
+
+def test_find_edges_marks_edges_but_not_thin_walls():
+    points, normals = sample_mesh(trimesh.creation.box([0.1, 0.1, 0.004]), 3000, np.random.default_rng(0))
+    edge, off = find_edges(points, normals), points[:, :2].abs().amax(1)
+    assert not bool(edge[off < 0.041].any()) and float(edge[off > 0.046].double().mean()) > 0.95
+
+
+def test_nearest_on_mesh_is_exact_and_takes_the_facing_side():
+    mesh, points = trimesh.creation.icosphere(subdivisions=4, radius=0.04), 1.2 * ball(0.04, 100)
+    found, _ = nearest_on_mesh(mesh, points)
+    distance = trimesh.proximity.closest_point_naive(mesh, points.numpy())[1]
+    assert np.abs((found - points).norm(dim=-1).numpy() - distance).max() < 1e-4
+    plate = trimesh.creation.box([0.1, 0.1, 0.002]).subdivide_to_size(0.01)
+    below, up = torch.tensor([[0.01, 0.02, -0.0008]]).double(), torch.tensor([[0.0, 0.0, 1.0]]).double()
+    assert nearest_on_mesh(plate, below)[1][0, 2] == -1 and nearest_on_mesh(plate, below, up)[1][0, 2] == 1
+
+
+def test_exact_arithmetic_confirms_certificates(generator):
+    points, lean = torch.randn(2, 10, 3, 3, generator=generator, dtype=torch.float64)
+    normals = unit(unit(points - points.mean(1, keepdim=True)) + 0.4 * lean)
+    found = certify(Contacts(points, normals), ContactSpec(friction=0.6, friction_margin=1.0))
+    phi, _ = solve_closure_lp(wrenches(points, normals, 0.6, 8).flatten(1, 2))
+    for i in range(10):
+        matrix = wrench_matrix(points[i].numpy(), normals[i].numpy(), 0.6, 8)
+        exact, little, witness = exact_margin(matrix), Fraction(1, 10**9), found.witness[i].numpy()
+        assert float(exact) == pytest.approx(float(found.margin[i]), abs=1e-10)
+        assert [proves_margin_above(matrix, phi[i].numpy(), exact + k * little) for k in (-1, 1)] == [True, False]
+        assert [proves_margin_below(matrix, witness, exact + k * little) for k in (-1, 1)] == [False, True]
+
+
+@pytest.mark.parametrize("condition", ["in place", "20 mm", "10 degrees", "afloat, 10 mm"])
+def test_misplace_moves_the_object_by_the_amount_of_the_condition(condition):
+    wrong, mesh, (_, grasp) = CONDITIONS[condition], cylinder((0.02, 0.01)), pinch("allegro")
+    planned, centre = grasp.obj_from_hand[0].double(), torch.tensor([*mesh.center_mass, 1.0])
+    for seed in range(5):
+        moved = planned @ inverse(planned @ _misplace(wrong, grasp, mesh, seed))
+        shift, turned = moved @ centre - centre, Rotation.from_matrix(moved[:3, :3].numpy()).as_rotvec()
+        assert float(shift.norm()) == pytest.approx(wrong.distance, abs=1e-9)
+        assert math.hypot(*turned) == pytest.approx(wrong.angle, abs=1e-7)
+        assert wrong.afloat or abs(float(shift[2])) < 1e-9
+
+
+def test_draw_solid_is_closed_and_near_the_mean_surface():
+    shape = fit_shape(load_object("jug").view, table=0.0)
+    one, other = draw_solid(shape, 0), draw_solid(shape, 1)
+    assert one.is_watertight and not np.array_equal(one.vertices, other.vertices)
+
+
+def test_median_over_resamples_families():
+    assert median_over([("tin", 1.0), ("tin", 3.0), ("cup", 2.0), ("jug", math.nan)]) == (2.0, 2.0, 2.0)
