@@ -16,7 +16,7 @@ from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_m
 from benchmarks.shape.accuracy import find_edges, mean_row, measure_shape
 from benchmarks.shape.walls import measure_walls
 from scipy.spatial.transform import Rotation
-from tests.cups import cup, cup_view
+from tests.make import cup, cup_view
 from torchgrasp.plan.closure import solve_closure_lp
 
 from tests.pinch import cylinder, pinch
