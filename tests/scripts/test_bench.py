@@ -16,13 +16,13 @@ from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_m
 from benchmarks.shape.accuracy import find_edges, mean_row, measure_shape
 from benchmarks.shape.walls import measure_walls
 from scipy.spatial.transform import Rotation
-from tests.make import cup, cup_view
-from torchgrasp.plan.closure import solve_closure_lp
 
+from tests.make import cup, cup_view
 from tests.pinch import cylinder, pinch
 from torchgrasp import Contacts, ContactSpec, PointCloud, certify, fit_shape, load_object
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.plan.closure import solve_closure_lp
 from torchgrasp.plan.wrench import wrenches
 
 RUNS = ("gpu/kernels", "hand/collision", "load/starts", "plan/truth", "scene/plane")
