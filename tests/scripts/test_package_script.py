@@ -23,7 +23,7 @@ def test_the_long_description_leads_nowhere_inside_the_project():
     for change in hook["substitutions"]:
         shown = re.sub(change["pattern"], change["replacement"], shown)
     targets = re.findall(r"\]\(([^)]*)\)", shown)
-    assert targets and all(target.startswith("https://") for target in targets)
+    assert all(target.startswith("https://") for target in targets)
     assert [x for x in readme.splitlines() if x.startswith("#")] == [x for x in shown.splitlines() if x.startswith("#")]
 
 
