@@ -9,12 +9,13 @@ import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp.control.grip import MIN_PUSH, PRIOR_STD, FrictionEstimate, GripHold
-from torchgrasp.control.least_forces import LeastForces, balance, friction_ratios, grasp_map
+from torchgrasp.control.least_forces import LeastForces, balance, friction_ratios
 from torchgrasp.control.observation import Observation
 from torchgrasp.errors import Status
 from torchgrasp.geometry.plane import Plane
 
 POINTS, OUTWARD = TARGET.numpy(), NORMALS.numpy()
+GRASP_MAP = balance(POINTS).wrench
 FREE = np.zeros((3, 3, 1))
 FLOOR = np.full(3, 0.1)
 
@@ -38,7 +39,7 @@ def least_sum(load: np.ndarray, friction: float) -> float:
         across = x.reshape(3, 3) + push(x)[:, None] * OUTWARD
         return friction**2 * push(x) ** 2 - (across**2).sum(-1)
 
-    held = {"type": "eq", "fun": lambda x: grasp_map(POINTS) @ x - load}
+    held = {"type": "eq", "fun": lambda x: GRASP_MAP @ x - load}
     cones = {"type": "ineq", "fun": slack}
     floors = {"type": "ineq", "fun": lambda x: push(x) - FLOOR}
     starts = [k * GAINS.desired_force.numpy().ravel() for k in (1.0, 2.0, 4.0)]
@@ -50,7 +51,7 @@ def least_sum(load: np.ndarray, friction: float) -> float:
 @pytest.mark.parametrize("load", [[0, 1, 0, 0, 0, 0], [0.5, 2, 1, 0, 0, 0.02], [0, 3, 0, 0.01, 0, 0]])
 def test_least_forces_carry_the_load_within_the_cones_at_nearly_the_least_sum(load, friction):
     forces = solve(load, friction)
-    assert np.allclose(grasp_map(POINTS) @ forces.ravel(), load, atol=1e-9)
+    assert np.allclose(GRASP_MAP @ forces.ravel(), load, atol=1e-9)
     assert (friction_ratios(forces, OUTWARD) < friction).all()
     push = -(forces * OUTWARD).sum(-1)
     assert (push > FLOOR).all()
@@ -105,8 +106,8 @@ def carried(
         lifted = min(max((k * PERIOD - 1.0) / 0.5, 0.0), 1.0) * weight
         bearing = np.zeros(6)
         bearing[1] = lifted
-        short = grasp_map(POINTS) @ hold.sent.ravel() - bearing
-        forces = hold.sent - (np.linalg.pinv(grasp_map(POINTS)) @ short).reshape(3, 3)
+        short = GRASP_MAP @ hold.sent.ravel() - bearing
+        forces = hold.sent - (np.linalg.pinv(GRASP_MAP) @ short).reshape(3, 3)
         push = -(forces * OUTWARD).sum(-1)
         slides = friction_ratios(forces, OUTWARD) > friction
         across = forces + push[:, None] * OUTWARD

@@ -11,7 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float
+
+from torchgrasp.plan.forces import grasp_map
 
 Array = np.ndarray
 
@@ -27,17 +30,9 @@ class Balance(NamedTuple):
     free: Float[Array, "n k"]
 
 
-def grasp_map(points: Float[Array, "f 3"]) -> Float[Array, "6 n"]:
-    """Return the map from the stacked forces at points [m] to force and torque about their centre."""
-    count = len(points)
-    cross = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
-    cross = ((points - points.sum(0) / count) @ cross).reshape(count, 3, 3)
-    return np.concatenate([np.tile(np.eye(3), count), cross.transpose(1, 0, 2).reshape(3, -1)])
-
-
 def balance(points: Float[Array, "f 3"]) -> Balance:
     """Return grasp map, its pseudo-inverse and its null space at points [m], by one decomposition."""
-    wrench = grasp_map(points)
+    wrench = grasp_map(torch.from_numpy(points)).numpy()
     left, values, right = np.linalg.svd(wrench)
     least = 1e-12 * values[0]  # contacts on one line have no greater singular value
     inverse = np.where(values > least, 1 / np.maximum(values, least), 0.0)
