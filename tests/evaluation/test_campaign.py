@@ -12,6 +12,7 @@ import trimesh
 from tests.pinch import cylinder, pinch
 from tests.scores import GOOD, SCORES, STUCK
 from torchgrasp.app import cli
+from torchgrasp.control import ClosingOptions
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation import views
@@ -198,9 +199,9 @@ def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys):
     ("changes", "known"),
     [
         ({}, True),
-        ({"without": ("retry",)}, True),
-        ({"without": ("guard",)}, True),
-        ({"without": ("guard", "retry")}, False),
+        ({"options": ClosingOptions(attempts=1)}, True),
+        ({"options": ClosingOptions(stops=0)}, True),
+        ({"options": ClosingOptions(stops=0, attempts=1)}, False),
         ({"closing": "open_loop"}, False),
         ({"table": False, "approach": 0.0}, False),
     ],

@@ -235,7 +235,7 @@ def test_bad_arguments_are_refused():
     with pytest.raises(BadArgument, match=r"grasp\.pregrasp: expected .*got 9 for"):
         close_hand(dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9), hand, mesh)
     for wrong, allowed in ((math.nan, "finite"), (0.0, "unit vector"), (2.0, "unit vector")):
-        with pytest.raises(BadArgument, match=rf"approach.*{allowed}"):
+        with pytest.raises(BadArgument, match=rf"{allowed}"):
             close_hand(dataclasses.replace(grasp, approach=wrong * grasp.approach), hand, mesh)
     with pytest.raises(MeshError, match="parts"):
         close_hand(grasp, hand, mesh, parts=[])
