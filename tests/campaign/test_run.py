@@ -114,7 +114,7 @@ def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, c
         (["--only", "jug"], "OBJECTS"), (["--licence", ""], "--licence"),
     ):  # fmt: skip
         assert cli.main([*words, *more]) == 2
-        assert capsys.readouterr().err.startswith(f"torchgrasp: {named}: found"), more
+        assert capsys.readouterr().err.startswith(f"torchgrasp: {named}: expected "), more
     assert list(tmp_path.iterdir()) == []
 
 
