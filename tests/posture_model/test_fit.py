@@ -91,7 +91,7 @@ def test_bad_arguments():
     with pytest.raises(BadArgument, match=r"regularisation: expected .*got nan"):
         fit_mixture(samples, 1, regularisation=float("nan"))
     stiff = dataclasses.replace(samples, joints=samples.joints.index_fill(1, torch.tensor([0]), 0.5))
-    with pytest.raises(BadArgument, match="got no variation in a$"):
+    with pytest.raises(BadArgument, match=r"got no variation in a$"):
         fit_mixture(stiff, 2)
     with pytest.raises(BadArgument, match=r"q: expected .*got nan"):
         dataclasses.replace(samples, q=samples.q * float("nan"))
