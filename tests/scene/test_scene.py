@@ -159,7 +159,7 @@ def test_a_target_cut_off_at_the_border_is_told(picture):
         ({"table": 2.0}, "table: expected .*got the camera .* below it"),
         ({"up": (0.0, 0.0, -1.0)}, "table: expected .*got .* above"),
         ({"intrinsics": (308.0, 308.0, 159.5, 119.5)}, "intrinsics: expected .*got a principal point"),
-        ({"scale": 1000.0}, "depth: expected .*got a median"),
+        ({"scale": 1000.0}, "depth: expected a median depth.*got 582 m"),
     ],
 )
 def test_bad_input_is_one_sentence(picture, given, message):
