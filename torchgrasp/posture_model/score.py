@@ -77,7 +77,7 @@ def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScor
 
     >>> from torchgrasp.hand.load import load_hand
     >>> from torchgrasp.posture_model.fit import fit_mixture
-    from torchgrasp.posture_model.mixture import load_mixture
+    >>> from torchgrasp.posture_model.mixture import load_mixture
     >>> from torchgrasp.posture_model.sample import sample_configurations
     >>> samples = sample_configurations(load_hand("barrett"), 500, seed=9, sampling="grasping")
     >>> evaluate_mixture(load_mixture("barrett"), samples).mean_error < 0.22
