@@ -29,6 +29,7 @@ def test_shipped_hands_obey_the_law(name):
     assert f"`{name}`" in README  # where its numbers come from, and how to drive it
 
 
+@pytest.mark.promise("H6")
 @pytest.mark.parametrize(("name", "share", "cells"), PLACES, ids=[f"{name}-{share}" for name, share, _ in PLACES])
 def test_tips_lie_where_public_descriptions_place_them(name, share, cells):
     import yourdfpy
