@@ -157,16 +157,16 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
 
 def _read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
     """Return a number in a range, or a truth value, as Python's own."""
+    number: Any = value
     if kind is bool:
         good = isinstance(value, bool | np.bool_)
     else:
         good = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
     if good and allowed is not None:  # huge whole numbers are compared as they are
-        x: Any = value
-        good = allowed.low <= x <= allowed.high and (abs(x) <= MOST or isinstance(x, float))
+        good = allowed.low <= number <= allowed.high and (abs(number) <= MOST or isinstance(value, float))
     if not good:
         raise BadArgument(name, show(value), describe(Annotated[kind, allowed] if allowed else kind))
-    return kind(value)
+    return kind(number)
 
 
 def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> Any:

@@ -160,10 +160,12 @@ class Fingertips(Value):
 def tips_from_files(spec: HandSpec, urdf: Urdf) -> Fingertips:
     """Return the fingertips of the chosen fingers."""
     links, tips = [x.name for x in urdf.links], tuple(f.tip_link for f in spec.fingers)
-    pads = [torch.tensor(x, dtype=torch.float64) for x in zip(*(f.pad for f in spec.fingers), strict=True)]
+    pads = zip(*(f.pad for f in spec.fingers), strict=True)
+    contact, normal, center, radius = (torch.tensor(x, dtype=torch.float64) for x in pads)
     carriers, poses = zip(*(pose_in_carrier(urdf, tip) for tip in tips), strict=True)
     chains = tree_from_urdf(urdf, carriers)
     carrier = torch.tensor([chains.link_names.index(name) for name in carriers])
     index = torch.tensor([links.index(tip) for tip in tips])
     names = tuple(f.name for f in spec.fingers)
-    return Fingertips(names, tips, index, *pads, chains, carrier, torch.stack(poses, -1)[..., None])
+    poses = torch.stack(poses, -1)[..., None]
+    return Fingertips(names, tips, index, contact, normal, center, radius, chains, carrier, poses)
