@@ -6,7 +6,7 @@ from typing import Any
 from paper.rows import Cell, Plan, Row, TableSpec
 from paper.tables6_7 import Asked, count_held, format_points, gather, median, write
 from paper.trials import run_cells
-from torchgrasp.evaluation import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
 from torchgrasp.files import format_columns
 
 PAPER_CHAIN, SUPPORT = Plan("paper", "paper", margins=False), Plan("paper", margins=False)

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 from torchgrasp.base import Value, check_whole
 from torchgrasp.errors import Status
-from torchgrasp.evaluation import seed_of
+from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode, Mode
 
 Support = Literal["camera", "paper"]

@@ -12,7 +12,8 @@ import tyro
 
 from paper.rows import Cell, Plan, Row, TableSpec
 from paper.trials import PAPER, run_cells
-from torchgrasp.evaluation import Share, contrast_over, count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation import Share
+from torchgrasp.evaluation.intervals import contrast_over, count_by, difference_over, format_share, share_over
 from torchgrasp.files import format_columns, format_json, write_file
 from torchgrasp.specs import ClosingMode, HoldingMode
 

@@ -20,11 +20,13 @@ from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
 from torchgrasp.data import list_views, read_family, read_group, read_object_mesh, read_view
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import GraspError, Status
-from torchgrasp.evaluation import PROTOCOLS, close_hand, draw_error, run_tasks, seed_of
+from torchgrasp.evaluation import PROTOCOLS, close_hand
+from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.ranking import rank_by_variance
+from torchgrasp.jobs import run_tasks
 from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP

@@ -28,8 +28,8 @@ from paper.trials import run_cells, subjects
 from torchgrasp import __version__
 from torchgrasp.app.report.page import render
 from torchgrasp.errors import GraspError, Status
-from torchgrasp.evaluation import run_tasks
 from torchgrasp.files import format_json, hold_folder, write_file
+from torchgrasp.jobs import run_tasks
 
 NOTE = (
     "Of M. Li, K. Hang, D. Kragic, A. Billard, <em>Dexterous grasping under shape uncertainty</em>, Robotics and "

@@ -13,7 +13,7 @@ from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.observation import Observation, Targets
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
-from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.geometry.frames import rotation_angle
 from torchgrasp.specs import TrialSpec
 

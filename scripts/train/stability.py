@@ -33,7 +33,7 @@ from torchgrasp.control import ClosingReference
 from torchgrasp.control.paper.impedance import Impedance
 from torchgrasp.control.paper.stability import FILE, NAMES, StabilityModel, lengths_of, state_of
 from torchgrasp.errors import BadArgument, GraspError
-from torchgrasp.evaluation.closing import GraspTrial
+from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit

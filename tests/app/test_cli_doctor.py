@@ -79,7 +79,6 @@ def test_the_selftest_passes_and_fails_where_a_verdict_is_another(monkeypatch, c
     assert cli.main(["selftest"]) == 0
     assert "1 of 1 verdicts right" in capsys.readouterr().out
     monkeypatch.setattr(golden, "GOLDEN", (golden.GOLDEN[0]._replace(hand="barrett", held=True),))
-    monkeypatch.setattr(golden, "OFF", 0.06)
     monkeypatch.setattr(golden.GoldenResult, "right", property(lambda _: False))
     assert cli.main(["selftest"]) == 1
     assert "(wrong)" in capsys.readouterr().out

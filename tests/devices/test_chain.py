@@ -21,7 +21,8 @@ from torchgrasp import (
 from torchgrasp.cloud import cut_object, diagnose_cloud, estimate_normals, format_report, save_cloud
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.prepare import prepare_cloud
-from torchgrasp.evaluation import draw_object_poses, find_protocol
+from torchgrasp.evaluation import find_protocol
+from torchgrasp.evaluation.protocols import draw_object_poses
 from torchgrasp.export import (
     format_graspgen,
     format_grasps,

@@ -75,7 +75,8 @@ def test_a_start_inside_a_neighbour_is_refused_but_neighbours_may_touch_the_tabl
 
 def test_neighbours_weigh_what_they_are_given_and_are_checked():
     pytest.importorskip("sapien")
-    from torchgrasp.evaluation import GraspTrial, TrialDriver
+    from torchgrasp.evaluation import GraspTrial
+    from torchgrasp.evaluation.trial import TrialDriver
     from torchgrasp.specs import TrialSpec
 
     hand, grasp = pinch("allegro")

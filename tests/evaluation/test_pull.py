@@ -10,9 +10,9 @@ from tests.pinch import cylinder, pinch
 from torchgrasp.control import squeeze
 from torchgrasp.control.forces import joint_stiffness
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import PROTOCOLS, PullSpec
 from torchgrasp.evaluation.pull import pull_grasp
+from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.geometry.frames import apply, inverse
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]

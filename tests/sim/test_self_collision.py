@@ -10,7 +10,7 @@ import trimesh
 
 from tests.pinch import QUICK, close, cylinder, pinch
 from torchgrasp.errors import HandFileError, Status
-from torchgrasp.evaluation.closing import GraspTrial, TrialDriver
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.mount import pair_masks
 from torchgrasp.sim.scene import open_scene

@@ -9,10 +9,10 @@ import torch
 from tests.pinch import QUICK as QUICK_SAPIEN
 from tests.pinch import close, cylinder, digest, digest_elsewhere, pinch
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.evaluation.protocols import PROTOCOLS
 from torchgrasp.evaluation.pull import pull_grasp
+from torchgrasp.evaluation.trial import GraspTrial
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 QUICK = dataclasses.replace(QUICK_SAPIEN, simulator="mujoco")

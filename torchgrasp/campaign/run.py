@@ -14,7 +14,7 @@ from torchgrasp.data.manifest import read_entries
 from torchgrasp.data.reader import GraspShards
 from torchgrasp.data.shards import JobRow, short
 from torchgrasp.errors import DatasetError, Status
-from torchgrasp.evaluation.campaign import PLAN_LIMIT, TRIAL_LIMIT
+from torchgrasp.evaluation.run import PLAN_LIMIT, TRIAL_LIMIT
 from torchgrasp.evaluation.views import View
 from torchgrasp.files import sha256
 from torchgrasp.hand.hand import Hand, HandSource
@@ -105,7 +105,7 @@ def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:
             rows.append(JobRow(short(ascii(name)), "", Status.BAD_OBJECT, short(str(entry))))
         else:
             of_object = JobRow(name, "", family=entry.family, group=entry.group)
-            rows += [of_object._replace(view=view) for view in sorted(entry.views)[: spec.trials.views]]
+            rows += [of_object._replace(view=view) for view in entry.list_views(most=spec.trials.views)]
             if not entry.views:
                 rows.append(of_object._replace(status=Status.BAD_OBJECT, note="the manifest names no view"))
     return tuple(rows)

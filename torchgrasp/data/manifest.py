@@ -57,6 +57,10 @@ class ObjectEntry:
     group: str
     mass: float | None
 
+    def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
+        """Return the sorted names of the views, at most so many; with `whole` only `WHOLE`."""
+        return ([WHOLE] if whole else sorted(self.views))[:most]
+
 
 @checked
 def list_entries(objects: Path | str, only: Sequence[str] = ()) -> list[str]:
@@ -192,7 +196,7 @@ def list_views(
     [('carton', 'view0')]
     """
     entries = {name: _parse_entry(name, field) for name, field in sorted(_read_fields(objects, only).items())}
-    return [(name, view) for name, x in entries.items() for view in ([WHOLE] if whole else sorted(x.views))[:most]]
+    return [(name, view) for name, x in entries.items() for view in x.list_views(whole, most)]
 
 
 @checked

@@ -1,6 +1,6 @@
-"""The golden set: shipped grasps with known verdicts, by which an installation shows that its simulators work.
+"""The golden set: shipped grasps with known verdicts, which check that the simulators of an installation work.
 
-`scripts/train.py golden` makes the grasps. A lost one is a held one whose hand stands 60 mm off: the fingers miss.
+`scripts/train.py golden` makes the grasps. For the verdict "lost" the hand stands 60 mm off, and the fingers miss.
 """
 
 import dataclasses
@@ -15,12 +15,9 @@ from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import Simulator, TrialSpec
 
-OFF = 0.06
-"""How far [m] the hand of a lost grasp stands back along its approach: no fingertip touches."""
-
 
 class GoldenCase(NamedTuple):
-    """A grasp of a shipped object; `held` is the verdict that is expected."""
+    """A grasp of a shipped object; `held` is the expected verdict."""
 
     object: str
     hand: str
@@ -35,11 +32,11 @@ GOLDEN = (
     GoldenCase("cylinder", "allegro", False),
     GoldenCase("jug", "barrett", False),
 )
-"""Both hands, two objects, either verdict."""
+"""Two hands, two objects, both verdicts."""
 
 
 class GoldenResult(NamedTuple):
-    """A case and what the simulator found; `seconds` of wall time."""
+    """A case and its simulated verdict; `seconds` is wall time."""
 
     case: GoldenCase
     held: bool
@@ -47,13 +44,13 @@ class GoldenResult(NamedTuple):
 
     @property
     def right(self) -> bool:
-        """Whether the verdict is the expected one."""
+        """Whether the verdict is as expected."""
         return self.held == self.case.held
 
 
 @checked
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
-    """Yield the result of each case of `GOLDEN` in a simulator, as they come.
+    """Yield the result of each case of `GOLDEN` in a simulator.
 
     Raises:
         MissingExtra: the simulator is not installed.
@@ -63,7 +60,7 @@ def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
         grasp = load_shipped_grasp(case.object, case.hand)
         error = torch.eye(4, dtype=torch.float64)
         if not case.held:
-            error[:3, 3] = -OFF * hand.approach
+            error[:3, 3] = -0.06 * hand.approach
         spec = dataclasses.replace(TrialSpec(), simulator=simulator, mass=0.1, hold_time=0.5)
         found = close_hand(grasp, hand, thing.mesh, spec, error=error, parts=thing.parts)
         yield GoldenResult(case, found.held, found.seconds)

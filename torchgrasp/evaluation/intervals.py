@@ -1,7 +1,7 @@
 """Shares and their 95 % intervals, by a bootstrap over families of objects.
 
-The trials of one object are alike, and so are objects of one family. So whole families are drawn anew, never trials:
-10 000 times, as many as there are, with replacement. The interval lies between the 2.5 % and 97.5 % quantiles.
+Trials of one object are correlated, and objects of one family are correlated. The bootstrap therefore resamples whole
+families, 10 000 times. The interval lies between the 2.5 % and 97.5 % quantiles.
 """
 
 import math
@@ -15,22 +15,16 @@ from torch import Tensor
 from torchgrasp.checks import Measured, Seed, checked
 
 RESAMPLES = 10_000
-"""Draws behind an interval: its ends are then known to a tenth of a point."""
-ONE_SIDED = 0.05
-"""Chance that a share lies beyond the bound that is given where every trial ended alike."""
+"""Number of resamples behind an interval."""
 
 Counts = Mapping[str, tuple[int | float, int]]
-"""How many trials passed, and of how many, for each unit that is resampled: a family, or an object without one. For a
-mean it is the sum of what was measured instead."""
+"""Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and number of values."""
 
 
 class Share(NamedTuple):
-    """A share or a difference of shares, its 95 % interval, and how many trials and units stand behind it.
+    """A share or a difference of shares, its 95 % interval, and the numbers of trials and of units.
 
-    A single unit has no interval: its ends are NaN. Nothing measured is NaN altogether.
-
-    >>> Share(0.9, 0.8, 1.0, total=20, units=10).low
-    0.8
+    The interval of a single unit is NaN. Without trials all values are NaN.
     """
 
     value: float
@@ -42,7 +36,7 @@ class Share(NamedTuple):
 
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
-    """Return the counts of outcomes that carry the name of their unit.
+    """Return the counts of outcomes, each with the name of its unit.
 
     >>> count_by([("tin", True), ("cup", False), ("tin", False)])
     {'tin': (1, 2), 'cup': (0, 1)}
@@ -56,10 +50,10 @@ def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]
 
 @checked
 def share_over(counts: Counts, seed: Seed = 0) -> Share:
-    """Return the share of all trials that passed, with its interval over the units.
+    """Return the share of passed trials, with its interval over the units.
 
-    Where all of n units passed in every trial, or in none, resampling tells nothing. The interval is then the one-sided
-    95 % bound of n independent trials that ended alike: 0.05 ** (1 / n) is its lower end, near 1 - 3 / n.
+    Where all trials passed, or none, the bootstrap has no width. The interval is then the one-sided 95 % bound of n
+    independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
 
     >>> share_over({"tin": (9, 10), "cup": (5, 10), "jug": (8, 10)})[::3]
     (0.7333333333333333, 30)
@@ -68,14 +62,14 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
     """
     found = contrast_over([counts], [1.0], seed)
     if found.units > 1 and found.value in (0.0, 1.0):
-        bound = ONE_SIDED ** (1 / found.units)
+        bound = 0.05 ** (1 / found.units)
         return found._replace(low=bound) if found.value else found._replace(high=1 - bound)
     return found
 
 
 @checked
 def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
-    """Return the mean of numbers that carry the name of their unit, with its interval; NaN is left out.
+    """Return the mean of numbers, each with the name of its unit, with its interval; NaN values do not count.
 
     >>> mean_over([("tin", 1.0), ("cup", 3.0), ("tin", 2.0)])[::3]
     (2.0, 3)
@@ -90,9 +84,9 @@ def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
 
 @checked
 def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
-    """Return by how much the first share is above the second; the units are paired.
+    """Return the first share minus the second share, paired by unit.
 
-    An interval without width says that the units agree, not that the difference is known.
+    An interval of zero width means that the units agree, not that the difference is exact.
 
     >>> difference_over({"tin": (4, 4), "cup": (4, 4)}, {"tin": (2, 4), "cup": (1, 4)})
     Share(value=0.625, low=0.5, high=0.75, total=8, units=2)
@@ -102,10 +96,9 @@ def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
 
 @checked
 def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
-    """Return a weighted sum of shares, each a ratio of sums over the same resampled units.
+    """Return a weighted sum of shares over the same resampled units.
 
-    The order of the units does not matter. `total` counts the trials of the first column. Resamples in which a column
-    has no trial are left out.
+    `total` counts the trials of the first column. Resamples without a trial in some column do not count.
 
     >>> new, old = {"tin": (4, 4), "cup": (4, 4)}, {"tin": (2, 4), "cup": (1, 4)}
     >>> found = contrast_over([new, old], [1.0, -1.0])

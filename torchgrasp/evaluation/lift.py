@@ -12,7 +12,7 @@ import torch
 from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun, smooth_step
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     import trimesh
 
 LIFT_TIME = 1.0
-"""Time [s] in which the hand rises: at most 0.6 m/s^2 over 0.1 m."""
+"""Time [s] in which the hand rises."""
 SHAKE_RATE = 5.0
-"""Frequency of the shaking [Hz]: 3 m/s^2 at 3 mm."""
+"""Frequency of the shaking [Hz]."""
 JUDGED_TIME = 0.2
-"""Time [s] at the end in which the fingers' contacts are judged: a single tick may miss one."""
+"""Time [s] at the end of a trial in which contacts are counted."""
 PUSHED_DISTANCE = 0.05
-"""Motion [m] of the object's centre while the hand closes that counts as pushed out: about a hand's opening."""
+"""Motion [m] of the object's centre during the closing that counts as ejected."""
 LOST_DISTANCE = 0.5
-"""Distance [m], beyond the lift, at which the object is gone and the trial over: out of the hand's reach."""
+"""Distance [m] of the object, beyond the lift, at which the trial ends."""
 SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
-"""Motion [m, rad] of the object in the hand since it pressed that counts as slipped: a planned next step would fail."""
+"""Motion [m, rad] of the object in the closed hand that counts as slipped."""
 
 
 @checked
@@ -57,22 +57,21 @@ def close_hand(
     """Close a hand on the true object, lift it and hold it, in simulation.
 
     The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises and holds. The object
-    is **held** if at the end its centre is up by half the lift, and two fingers touched it in most of the last
-    `JUDGED_TIME`. It must also have slipped by less than 20 mm and 30 degrees since the hand pressed. Equal arguments
-    give equal bits.
+    is **held** under three conditions: its centre rose by half the lift, two fingers touch it at the end, and it
+    slipped by less than 20 mm and 30 degrees in the closed hand. Equal arguments give equal bits.
 
     Args:
         grasp: one row.
-        hand: the hand that the grasp was planned for.
+        hand: the hand of the grasp.
         mesh: the true object [m], closed, in the frame of the grasp: a trimesh or a file.
         spec: of the trial; None: `TrialSpec()`.
         seed: of the tactile sensor's noise.
-        error: true pose of the hand in its planned frame, unknown to the hand; None: the planned pose.
-        parts: convex bodies that stand for the mesh; None: its own decomposition (`convex_parts`).
-        table: what the object stands on, in the frame of the grasp; None: level, at the mesh's lowest point.
-        neighbours: further bodies on the table, which the hand may push.
-        surface: estimated surface of the object (`surface_field`), by which touches tell where it is; None: the
-            contacts' tangent planes alone tell it.
+        error: true pose of the hand in its planned frame, unknown to the controller; None: the planned pose.
+        parts: convex parts of the mesh; None: they are computed (`convex_parts`).
+        table: the table below the object, in the frame of the grasp; None: horizontal, at the mesh's lowest point.
+        neighbours: other bodies on the table, which the hand may push.
+        surface: estimated surface of the object (`surface_field`) with which contacts are compared to estimate the
+            object's pose; None: the tangent planes of the planned contacts.
 
     Raises:
         BadArgument: not exactly one row, joints of another hand, or a pre-grasp outside the joint limits.
@@ -94,31 +93,27 @@ def close_hand(
 @checked
 @single_threaded
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
-    """Run a trial; see `close_hand`.
+    """Run a trial; see `close_hand`."""
+    return run_lift(TrialDriver(trial, TrialSpec() if spec is None else spec))
 
-    >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
-    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> lift_grasp(trial, TrialSpec(closing="open_loop", lift_height=0.0, hold_time=0.0)).status.name
-    'OK'
-    """
+
+def run_lift(driver: TrialDriver) -> ClosureResult:
+    """Close, lift and hold in a fresh scene."""
     started = time.perf_counter()
-    driver = TrialDriver(trial, TrialSpec() if spec is None else spec)
-    run = driver.open()
-    lift = _Lift(run)
+    lift = _Lift(driver.open())
     status = lift.perform()
     return lift.result(status, time.perf_counter() - started)
 
 
 class _ObjectLost(Exception):
-    """The object is gone."""
+    """The object is out of reach."""
 
 
 class _Tick(NamedTuple):
-    """The truth at a tick; `touching` counts fingers on the object, `centre` is the object's mass centre [m].
+    """The simulated state at a tick.
 
-    `contact` has a row a finger: force, point, normal, speed of sliding, blend. `felt` is friction and load.
+    `touching` counts fingers on the object, `centre` is the object's mass centre [m]. `contact` has force, point,
+    normal, sliding speed and blend of each finger. `felt` has the estimated friction and load.
     """
 
     time: float
@@ -175,7 +170,7 @@ class _Lift:
         return self._verdict()
 
     def _put_down(self, time: float, rising: float) -> Status:
-        """Lower the hand to where it was, in the time [s] in which it rose that far, and open it no further."""
+        """Lower the hand in the time [s] of the rise so far."""
         height, _ = self._height(time, rising)
         ticks = self.run.robot.ticks(min(time, rising))
         for k in range(ticks):
@@ -196,7 +191,7 @@ class _Lift:
         return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)
 
     def _record(self) -> None:
-        """Append a tick; raise if the object diverged or is gone."""
+        """Append a tick; raise an error if the simulation diverged or the object is out of reach."""
         robot, scene = self.run.robot, self.run.scene
         now, touching, pose = robot.steps * self.spec.timestep, int(robot.finger.sum()), scene.object_pose()
         centre = pose[:3, :3] @ scene.centre + pose[:3, 3]
@@ -217,7 +212,7 @@ class _Lift:
         return float(np.linalg.norm(self.ticks[-1].centre - self.ticks[0].centre))
 
     def _all_touched(self) -> bool:
-        """Return whether all fingers have touched, or the closing is over."""
+        """Return whether all fingers have touched the object, or the closing has ended."""
         return self.run.controller.hold is not None or bool(np.isfinite(self.run.robot.first_touch).all())
 
     def _verdict(self) -> Status:
@@ -237,7 +232,7 @@ class _Lift:
         return Status.DROPPED if rise.max() >= half else Status.NOT_LIFTED
 
     def _motion(self, first: int | None, last: int | None, in_hand: bool = True) -> ObjectMotion:
-        """Return the motion of the object between two ticks, in the hand or in the world; None: a tick not reached."""
+        """Return the object's motion between two ticks, in the hand or the world; NaN if a tick was not reached."""
         if first is None or last is None:
             return ObjectMotion(math.nan, math.nan)
         start, end = (torch.from_numpy(self.ticks[k].object_pose) for k in (first, last))

@@ -1,4 +1,4 @@
-"""Pulls at a grasped object in six directions, and either kind of protocol: pulls or a lift."""
+"""Pulls at a grasped object in six directions, and trials under a protocol."""
 
 import dataclasses
 import math
@@ -12,10 +12,10 @@ from torchgrasp.base import Value
 from torchgrasp.checks import Measured, Range, checked
 from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.closing import GraspTrial, TrialDriver, TrialRun
-from torchgrasp.evaluation.lift import lift_grasp
+from torchgrasp.evaluation.lift import run_lift
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, find_protocol
 from torchgrasp.evaluation.score import ProtocolResult
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.geometry.frames import rotation_angle
 from torchgrasp.threads import single_threaded
 
@@ -23,18 +23,16 @@ DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0
 """-x, +x, -y, +y, -z, +z of the world."""
 
 CHECK_SECONDS = 0.2
-"""Interval [s] between two looks at the pulled object: ten in a pull of 2 s."""
+"""Interval [s] at which the pulled object's motion is checked."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """Whether the object stayed in every direction, and its largest motion [m, rad].
+    """Whether the object stayed in all directions, and its largest motion [m, rad].
 
-    `directions` were tried, `status` is of the last. `force` [N] is the fingers' mean before the first pull, or NaN.
-
-    >>> PullResult(True, Status.OK, 6, moved=0.004, turned=0.02, force=6.8, seconds=2.0).passed
-    True
+    `status` is of the last of the `directions` that were tried. `force` [N] is the fingers' mean normal force before
+    the first pull, or NaN. `seconds` is CPU time.
     """
 
     passed: bool
@@ -49,12 +47,12 @@ class PullResult(Value):
 @checked
 @single_threaded
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
-    """Close a hand on the true object and pull along the world's axes, each in a fresh scene until one fails.
+    """Close a hand on the true object and pull along the world's axes, each in a fresh scene, until a pull fails.
 
-    Motion counts from before the hand closed. `protocol` may be a name in `PROTOCOLS`.
+    The object's motion includes its motion during the closing. `protocol` may be a name in `PROTOCOLS`.
 
     Raises:
-        BadArgument: an unknown protocol or one that lifts; else as `close_hand`.
+        BadArgument: an unknown protocol, or a protocol that lifts; otherwise as `close_hand`.
         MeshError, MissingExtra: as `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
@@ -65,14 +63,18 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     >>> found.passed, found.directions
     (True, 6)
     """
-    started = time.process_time()
     protocol = find_protocol(protocol)
     if protocol.pull is None:
-        raise BadArgument("protocol", f"{protocol.name!r}, which lifts", "one that pulls")
-    driver = TrialDriver(trial, protocol.trial)
+        raise BadArgument("protocol", f"{protocol.name!r}, which lifts", "a protocol that pulls")
+    return run_pulls(TrialDriver(trial, protocol.trial), protocol.pull)
+
+
+def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
+    """Pull in each direction, in fresh scenes, until a pull fails."""
+    started = time.process_time()
     status, largest, force, tried = Status.OK, np.zeros(2), math.nan, 0
     while status is Status.OK and tried < len(DIRECTIONS):
-        status, motion, pressed = _pull(driver.open(), protocol.pull, DIRECTIONS[tried])
+        status, motion, pressed = _pull(driver.open(), spec, DIRECTIONS[tried])
         largest, tried = np.maximum(largest, motion), tried + 1
         force = pressed if math.isnan(force) else force
     moved, turned = largest.tolist()
@@ -103,7 +105,7 @@ def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status,
 
 
 def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.ndarray]:
-    """Return how far [m, rad] the object is from its start, and whether that is allowed."""
+    """Return a status and the object's motion [m, rad] from its start."""
     pose, centre = run.scene.object_pose(), np.append(run.scene.centre, 1.0)
     if not np.isfinite(pose).all():
         return Status.UNSTABLE, np.full(2, math.inf)
@@ -120,7 +122,7 @@ def run_protocol(
     rank: Annotated[int, Range(0, 1000000)] = 0,
     draw: Annotated[int, Range(0, 1000000)] = 0,
 ) -> ProtocolResult:
-    """Put one grasp to a protocol; see `pull_grasp` and `lift_grasp`.
+    """Try one grasp under a protocol; see `pull_grasp` and `lift_grasp`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_object, load_shipped_grasp
@@ -130,13 +132,14 @@ def run_protocol(
     True
     """
     started = time.process_time()
-    overlap = TrialDriver(trial, protocol.trial).grasp_overlap()
+    driver = TrialDriver(trial, protocol.trial)
+    overlap = driver.grasp_overlap()
     if protocol.pull is not None:
-        pull = pull_grasp(trial, protocol)
+        pull = run_pulls(driver, protocol.pull)
         status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
         slip = ObjectMotion(math.nan, math.nan)
     else:
-        lift = lift_grasp(trial, protocol.trial)
+        lift = run_lift(driver)
         status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
         force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
     spent = time.process_time() - started

@@ -1,17 +1,18 @@
-"""Sums over attempts: shares, failures by stage, forces and times."""
+"""Sums over attempts: shares, failures by stage, forces, times, and the calibration of predicted success."""
 
 import dataclasses
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Measured, checked
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.calibration import judge
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
 from torchgrasp.values import Grasps
 
@@ -34,14 +35,17 @@ STAGES: dict[str, tuple[Status, ...]] = {
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of the grasp of a `rank` under a `draw` of pose errors; NaN: not measured.
+    """The outcome of one grasp, at a `rank`, under one `draw` of pose errors; NaN: not measured.
 
-    The object moved by `moved` [m] and `turned` [rad], in a lift relative to the hand. `force` [N] is the fingers' mean
-    normal force, `overlap` [m] the depth of the grasp pose in the object, `seconds` CPU time. In a lift the object
-    slipped by `slip` [m] and `slip_angle` [rad] since the hand pressed. `predicted` is the grasp's predicted success.
-
-    >>> ProtocolResult(rank=0, draw=0, passed=True, status=Status.OK, predicted=0.9).predicted
-    0.9
+    Args:
+        moved: motion of the object [m]; in a lift relative to the hand.
+        turned: rotation of the object [rad]; in a lift relative to the hand.
+        force: mean normal force of the fingers [N].
+        overlap: overlap of hand and object at the grasp [m].
+        seconds: CPU time.
+        slip: motion of the object in the closed hand [m], in a lift.
+        slip_angle: its rotation [rad].
+        predicted: predicted success of the grasp.
     """
 
     rank: int
@@ -61,13 +65,17 @@ class ProtocolResult(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ViewScore(Value):
-    """The outcome of a view with `executable` planned grasps.
+    """The outcome of a view.
 
-    Without any, `refusal` is the commonest reason; `note` may say more. `seconds` is the CPU time of planning. `family`
-    and `group` are the object's (`torchgrasp.data`), "" where unknown. `fingers` are those that grasp.
-
-    >>> ViewScore("mug", "view0", executable=0, seconds=4.0, refusal=Status.OUT_OF_REACH, family="cup").unit
-    'cup'
+    Args:
+        executable: number of executable grasps.
+        seconds: CPU time of planning.
+        attempts: results of the grasps that were tried.
+        refusal: the most frequent failure where no grasp is executable.
+        note: details of the failure.
+        family: family of the object (`torchgrasp.data`), or "".
+        group: group of the object, or "".
+        fingers: the grasping fingers.
     """
 
     object: str
@@ -83,21 +91,22 @@ class ViewScore(Value):
 
     @property
     def unit(self) -> str:
-        """Return what is resampled for intervals: the family, or the object without one."""
+        """Return the unit that intervals resample: the family, or the object if it has none."""
         return self.family or self.object
 
 
 @checked
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the numbers of an evaluation by name.
+    """Return the numbers of an evaluation by name; intervals are over families.
 
-    "gsr" is the share of attempts that passed; views without a grasp are not in it. "top1" is that of the best-ranked
-    grasps: a view without grasps fails in every draw. "objects" is the share of objects with a success. Their intervals
-    are over families (`share_over`). "by_object" and "by_group" have the same of parts. "refused" counts views without
-    a grasp, "failures" the reasons of each stage, "fingers" the views by the fingers that grasp. "force_n",
-    "overlap_mm", "plan_cpu_s" (of a view) and "trial_cpu_s" are means. "slip_mm" and "slip_deg" are the median and the
-    95 % quantile over the grasps that held. "success" judges the predictions
-    (`torchgrasp.evaluation.calibration.judge`); None without any.
+    * "gsr": share of attempts that passed.
+    * "top1": share of best-ranked grasps that passed; a view without grasps fails in every draw.
+    * "objects": share of objects with a success. "refused": number of views without a grasp.
+    * "by_object", "by_group": the same numbers of parts.
+    * "failures": counts of statuses by stage. "fingers": counts of views by the grasping fingers.
+    * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
+    * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
+    * "success": calibration of the predictions (`judge`), or None.
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)
@@ -149,7 +158,7 @@ def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
 
 
 def _judge_predictions(scores: Sequence[ViewScore]) -> dict[str, Any] | None:
-    """Return how true predicted success was, or None where nothing was predicted."""
+    """Return the calibration of predicted success, or None without predictions."""
     known = [(score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)]
     if not known:
         return None
@@ -172,22 +181,70 @@ def _mean(values: Iterable[float]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
+class Bin(NamedTuple):
+    """Predictions in [low, high): their mean, and the share of their trials that passed."""
+
+    low: float
+    high: float
+    predicted: float
+    passed: Share
+
+
+def judge(
+    predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]
+) -> dict[str, float | list[Bin]]:
+    """Return how well predicted probabilities agree with outcomes; `units` are resampled for the intervals of the bins.
+
+    "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect predictions and 0
+    for the base rate. "auc" is the area under the ROC curve. "error" is the expected calibration error over the "bins".
+
+    >>> found = judge(torch.tensor([0.15, 0.11, 0.9]), torch.tensor([False, True, True]), ["tin", "cup", "tin"])
+    >>> [(round(x.low, 1), round(x.predicted, 2), x.passed.value) for x in found["bins"]], found["auc"]
+    ([(0.1, 0.13, 0.5), (0.9, 0.9, 1.0)], 0.5)
+    """
+    outcome = passed.to(predicted)
+    brier, rate, bins = float((predicted - outcome).square().mean()), outcome.mean(), _bins(predicted, passed, units)
+    off = sum(abs(x.predicted - x.passed.value) * x.passed.total for x in bins)
+    return {
+        "predicted": float(predicted.mean()),
+        "passed": float(rate),
+        "brier": brier,
+        "skill": 1 - brier / float(rate * (1 - rate)) if 0 < rate < 1 else math.nan,
+        "auc": _area_under_curve(predicted, passed),
+        "error": off / len(passed) if bins else math.nan,
+        "bins": bins,
+    }
+
+
+def _bins(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]) -> list[Bin]:
+    """Return ten bins of equal width, without the empty ones."""
+    at, bins = (predicted * 10).long().clamp(0, 9), []
+    for k in at.unique().tolist():
+        rows: list[int] = torch.nonzero(at == k)[:, 0].tolist()
+        counts = count_by((units[row], bool(passed[row])) for row in rows)
+        bins.append(Bin(k / 10, (k + 1) / 10, float(predicted[rows].mean()), share_over(counts)))
+    return bins
+
+
+def _area_under_curve(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"]) -> float:
+    """Return how often a passed trial had a higher prediction than a failed trial; ties count half."""
+    good, bad = predicted[passed], predicted[~passed].sort().values
+    if not len(good) or not len(bad):
+        return math.nan
+    below, upto = torch.searchsorted(bad, good), torch.searchsorted(bad, good, right=True)
+    return float((below + upto).double().mean()) / 2 / len(bad)
+
+
 @checked
 def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
-    """Return whether the finger on the most certain contact was the first to touch, as Sec. 5 expects of Eq. (27).
+    """Return whether the finger with the most certain contact touched first, as Sec. 5 expects of Eq. (27).
 
     Args:
-        contact_order: fingers by their first touch (`ClosureResult`); without any the answer is no.
-        grasp: one row; of equally certain fingers any may be the first.
+        contact_order: fingers by their first touch (`ClosureResult`).
+        grasp: one row; of equally certain fingers any may be first.
 
     Raises:
         BadArgument: not exactly one row, or contacts without `std_m`.
-
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> grasp = load_shipped_grasp("jug", "barrett")
-    >>> order = grasp.contacts.require_std()[0].argsort().tolist()
-    >>> most_certain_first(order, grasp), most_certain_first(order[::-1], grasp)
-    (True, False)
     """
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")

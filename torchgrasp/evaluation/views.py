@@ -1,4 +1,4 @@
-"""One view of a data set: planned on as a robot sees it, and its grasps put to a protocol on the true mesh."""
+"""One view of a folder of objects: grasps are planned on it and tried under a protocol on the true mesh."""
 
 import dataclasses
 import functools
@@ -10,10 +10,10 @@ from torchgrasp.base import Value, count_status
 from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.data import read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
-from torchgrasp.evaluation.closing import GraspTrial
 from torchgrasp.evaluation.protocols import Protocol, draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
+from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand, HandSource
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     import trimesh
 
 MOST_FRICTION = 1.0
-"""Largest friction that grasps are planned for: MultiDex grants 3, more than fingertips have."""
+"""Largest friction that grasps are planned for, below the friction of some protocols."""
 REFUSAL = "refusal"
-"""Where the file of a view's executable grasps keeps why there are none: a later call that tries them says it, too."""
+"""Key of the metadata of saved grasps with the reason why a view has none."""
 
 Ranks = Literal["best", "spread"]
-"""Which of a view's grasps are tried: the best, or as many spread from the best to the worst."""
+"""Which grasps of a view are tried: the best, or as many spread over all ranks."""
 
 
 @checked
@@ -82,7 +82,7 @@ class EvaluationSpec(Value):
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the rows of a view's executable grasps that are tried.
+    """Return the ranks of the grasps that are tried.
 
     >>> choose_rows(100, 5, "best"), choose_rows(100, 5, "spread"), choose_rows(3, 5, "spread")
     ([0, 1, 2, 3, 4], [0, 25, 50, 74, 99], [0, 1, 2])
@@ -104,7 +104,7 @@ class View:
 
     @property
     def score(self) -> ViewScore:
-        """The score before any work."""
+        """The score before planning."""
         entry = read_entry(self.objects, self.object)
         return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
 
@@ -114,10 +114,7 @@ class View:
 
 
 class PlannedView(NamedTuple):
-    """What planning on a view gave: its score without attempts, what was seen, and the executable grasps.
-
-    Without cloud and grasps the object was refused.
-    """
+    """The score of a view without attempts, its cloud and its executable grasps; None if the object was refused."""
 
     score: ViewScore
     cloud: PointCloud | None = None
@@ -125,52 +122,54 @@ class PlannedView(NamedTuple):
 
 
 def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path | None = None) -> PlannedView:
-    """Plan on a view; without any executable grasp, name the commonest failure.
-
-    `planned` is a file of grasps of an earlier call, which are read instead.
+    """Plan on a view, or read the grasps of an earlier call from the file `planned`.
 
     Raises:
-        MissingExtra, OutputError: no fault of the object.
+        MissingExtra, OutputError: errors that are independent of the object.
     """
     hand, score = view.load_hand(), view.score
     started = time.process_time()
-    cloud = grasps = None
     try:
-        _read_solid(view.objects, view.object)  # a bad mesh is refused before any work; its parts are cached
-        seen = read_view(view.objects, view.object, view.view)
+        _read_solid(view.objects, view.object)  # a bad mesh is refused before planning; its parts are cached
+        cloud = read_view(view.objects, view.object, view.view)
         if planned is not None:
-            grasps = load_grasps(planned)
-            if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(seen), hand.source.sha256):
-                raise BadArgument("folder", f"{planned} of another cloud or hand", "grasps of this view")
-            fingers = grasps.meta.get("finger_names", "")
-            told = Status.__members__.get(grasps.meta.get(REFUSAL, ""), Status.OUT_OF_REACH)
-            refusal = Status.OK if len(grasps) else told
-            score = dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers)
-            return PlannedView(score, seen, grasps)
+            return PlannedView(*_read_planned(planned, score, cloud, hand))
         started = time.process_time()
         contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=Plane.horizontal(0.0))
-        stages: list[tuple[str, str, Any]] = []
+        stages: dict[str, Any] = {}
         found = plan_grasps(
-            seen, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers, observer=lambda *x: stages.append(x)
-        )
-        cloud, grasps = seen, found[found.status == Status.OK]
-        starts = next(value.status for name, _, value in stages if name == "plan")
-        failed = count_status(found.status if len(found) else starts[starts != Status.OK])
-        refusal = Status.OK if len(grasps) else next(iter(failed), Status.OUT_OF_REACH)
-        fingers = found.meta["finger_names"]
-        score = dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers)
-    except (MissingExtra, OutputError):  # a full disk is no fault of the object
+            cloud, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers,
+            observer=lambda name, _, value: stages.setdefault(name, value),
+        )  # fmt: skip
+    except (MissingExtra, OutputError):
         raise
     except GraspError as error:
-        cloud = grasps = None
-        score = dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=" ".join(str(error).split()))
-    return PlannedView(dataclasses.replace(score, seconds=time.process_time() - started), cloud, grasps)
+        note, spent = " ".join(str(error).split()), time.process_time() - started
+        return PlannedView(dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=note, seconds=spent))
+    grasps, starts = found[found.status == Status.OK], stages["plan"].status
+    failed = count_status(found.status if len(found) else starts[starts != Status.OK])
+    refusal = Status.OK if len(grasps) else next(iter(failed), Status.OUT_OF_REACH)
+    score = dataclasses.replace(
+        score, executable=len(grasps), refusal=refusal, fingers=found.meta["finger_names"],
+        seconds=time.process_time() - started,
+    )  # fmt: skip
+    return PlannedView(score, cloud, grasps)
+
+
+def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -> tuple[ViewScore, PointCloud, Grasps]:
+    """Read the grasps that an earlier call planned on a cloud for a hand."""
+    grasps = load_grasps(path)
+    if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.source.sha256):
+        raise BadArgument("folder", f"{path} of another cloud or hand", "grasps of this view")
+    reason = Status.__members__.get(grasps.meta.get(REFUSAL, ""), Status.OUT_OF_REACH)
+    refusal, fingers = Status.OK if len(grasps) else reason, grasps.meta.get("finger_names", "")
+    return dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers), cloud, grasps
 
 
 def try_grasp(
     view: View, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
 ) -> ProtocolResult:
-    """Try one grasp of a view; `at` is its rank, and the draw of what the robot does not know."""
+    """Try one grasp of a view; `at` is its rank and the number of the draw of its pose error."""
     hand = hand_of(grasp, view.load_hand())
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, *at)
@@ -184,12 +183,12 @@ def try_grasp(
 
 @functools.lru_cache(maxsize=2)
 def _fit_surface(objects: Path, name: str, view: str) -> SignedDistanceField:
-    """Return the estimated surface of what a robot sees, by which touches tell it where the object is."""
+    """Return the estimated surface of a view, with which contacts are compared."""
     return surface_field(fit_shape(read_view(objects, name, view), table=Plane.horizontal(0.0)))
 
 
 @functools.lru_cache(maxsize=2)
 def _read_solid(objects: Path, name: str) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Return mesh and convex parts, kept for the next trial."""
+    """Return mesh and convex parts of an object."""
     mesh = read_object_mesh(objects, name)
     return mesh, convex_parts(mesh)

@@ -29,7 +29,7 @@ class SimulatedHand:
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> from torchgrasp.evaluation import GraspTrial, TrialDriver
+    >>> from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
     >>> from torchgrasp.specs import TrialSpec
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)

@@ -28,19 +28,14 @@ from torchgrasp.closure import ClosureResult
 from torchgrasp.control.observation import joint_jacobian
 from torchgrasp.data import list_views, read_mass
 from torchgrasp.errors import GraspError, Status
-from torchgrasp.evaluation import (
-    close_hand,
-    count_by,
-    difference_over,
-    format_share,
-    run_tasks,
-    seed_of,
-)
-from torchgrasp.evaluation.intervals import share_over
+from torchgrasp.evaluation import close_hand
+from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.files import format_json, write_file
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
+from torchgrasp.jobs import run_tasks
 
 FRICTIONS = (0.4, 0.7, 1.0)
 """Frictions that the hand does not know."""

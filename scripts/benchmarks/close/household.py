@@ -28,21 +28,13 @@ from benchmarks.perturb import (
 )
 from torchgrasp.data import list_views, read_mass, read_object_mesh, read_view
 from torchgrasp.errors import GraspError, Status
-from torchgrasp.evaluation import (
-    PROTOCOLS,
-    PoseNoise,
-    close_hand,
-    count_by,
-    difference_over,
-    draw_error,
-    format_share,
-    run_tasks,
-    seed_of,
-    share_over,
-)
+from torchgrasp.evaluation import PROTOCOLS, PoseNoise, close_hand
+from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.files import format_json, write_file
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.load import load_hand
+from torchgrasp.jobs import run_tasks
 from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import surface_field

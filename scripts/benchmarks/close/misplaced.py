@@ -40,23 +40,15 @@ from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand, plan
 from torchgrasp.closure import SensorModel
 from torchgrasp.data import list_views, read_mass, read_view
 from torchgrasp.errors import GraspError
-from torchgrasp.evaluation import (
-    PROTOCOLS,
-    GraspTrial,
-    count_by,
-    difference_over,
-    format_share,
-    lift_grasp,
-    pull_grasp,
-    run_tasks,
-    seed_of,
-    share_over,
-)
-from torchgrasp.evaluation.protocols import error_from_object_pose
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, pull_grasp
+from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.lift import lift_grasp
+from torchgrasp.evaluation.protocols import error_from_object_pose, seed_of
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import write_file
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.jobs import run_tasks
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import surface_field

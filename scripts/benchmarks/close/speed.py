@@ -15,7 +15,8 @@ from torchgrasp import ContactSpec, TrialSpec, close_hand, fit_shape, load_grasp
 from torchgrasp.control import GraspController, Observation
 from torchgrasp.data.shipped import GraspObject
 from torchgrasp.errors import Status
-from torchgrasp.evaluation import GraspTrial, TrialDriver
+from torchgrasp.evaluation import GraspTrial
+from torchgrasp.evaluation.trial import TrialDriver
 from torchgrasp.jobs import run_tasks
 from torchgrasp.shape.surface import surface_field
 

@@ -15,10 +15,10 @@ from tqdm import tqdm
 from benchmarks.common import Options, Row, bench
 from torchgrasp.data import list_views, read_family, read_object_mesh, read_view
 from torchgrasp.errors import Status
-from torchgrasp.evaluation import calibration
-from torchgrasp.evaluation.closing import GraspTrial
+from torchgrasp.evaluation import score
 from torchgrasp.evaluation.protocols import PROTOCOLS, draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
+from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
@@ -209,9 +209,9 @@ def leave_one_out(trials: Trials) -> np.ndarray:
 
 
 def describe(predicted: np.ndarray, trials: Trials) -> dict[str, Any]:
-    """Return what `torchgrasp.evaluation.calibration` finds of predictions, with intervals over families."""
+    """Return what `torchgrasp.evaluation.score` finds of predictions, with intervals over families."""
     passed = torch.from_numpy(trials.passed.astype(bool))
-    return calibration.judge(torch.from_numpy(predicted), passed, trials.family.tolist())
+    return score.judge(torch.from_numpy(predicted), passed, trials.family.tolist())
 
 
 def judge(predicted: np.ndarray, trials: Trials) -> list[str]:

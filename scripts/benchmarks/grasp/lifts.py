@@ -10,7 +10,8 @@ from benchmarks.common import Options, Row, bench
 from torchgrasp import ContactSpec, PointCloud, Status, TrialSpec, close_hand, load_hand, plan_grasps
 from torchgrasp.base import count_status
 from torchgrasp.data import list_views, read_object_mesh, read_view
-from torchgrasp.evaluation import EvaluationSpec, evaluate, format_share, summarise
+from torchgrasp.evaluation import EvaluationSpec, evaluate, summarise
+from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.files import format_line
 
 

@@ -17,10 +17,13 @@ from benchmarks.common import Options, Row, bench
 from benchmarks.scene.drop import PlacedScene, aim, drop, settle
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation import GraspTrial, Share, count_by, format_share, lift_grasp, run_tasks, share_over
+from torchgrasp.evaluation import GraspTrial, Share
+from torchgrasp.evaluation.intervals import count_by, format_share, share_over
+from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of, load_hand
+from torchgrasp.jobs import run_tasks
 from torchgrasp.planner import ScenePlan, plan_scene
 from torchgrasp.scene import Scene
 from torchgrasp.sim.scene_spec import Neighbour

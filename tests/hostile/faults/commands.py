@@ -19,7 +19,7 @@ from torchgrasp.app.report import page
 from torchgrasp.data.shards import JobRow, Shard, pack_shard
 from torchgrasp.data.shipped import DATA
 from torchgrasp.errors import Status
-from torchgrasp.evaluation import campaign
+from torchgrasp.evaluation import run as campaign
 from torchgrasp.evaluation.protocols import Protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.evaluation.views import EvaluationSpec, View

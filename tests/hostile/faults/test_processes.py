@@ -38,7 +38,7 @@ import dataclasses, os, signal, sys, time
 from pathlib import Path
 from torchgrasp.app import cli
 from torchgrasp.errors import Status
-from torchgrasp.evaluation import campaign
+from torchgrasp.evaluation import run as campaign
 from torchgrasp.evaluation.score import ProtocolResult
 
 def plan(view, friction, spec):

@@ -14,9 +14,9 @@ from torchgrasp.campaign.folder import FAILED
 from torchgrasp.checks import Count, Range, Seed
 from torchgrasp.data import JobRow, list_entries, list_views
 from torchgrasp.errors import BadArgument, DatasetError, Status
-from torchgrasp.evaluation.campaign import evaluate
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
+from torchgrasp.evaluation.run import evaluate
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
 from torchgrasp.files import format_columns, format_json, format_line, hold_folder, write_file

@@ -1,4 +1,4 @@
-"""The one driver of trials: a fresh scene, the approach, the closing and the pressing."""
+"""The driver of trials: a fresh scene, the approach, the closing and the pressing."""
 
 import dataclasses
 import math
@@ -36,21 +36,13 @@ if TYPE_CHECKING:
     Solid = trimesh.Trimesh | Path | str
 
 APPROACH_SPEED = 0.2
-"""Mean speed of the hand on its way to the pre-grasp [m/s]: slow enough to push a light object without a blow."""
+"""Mean speed [m/s] of an unguarded approach."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """A grasp and the true object, as in `close_hand`.
-
-    >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
-    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> TrialDriver(trial, TrialSpec()).grasp_overlap() < 0.01  # [m] of the fingertips at their contacts
-    True
-    """
+    """A grasp and the true object, as in `close_hand`."""
 
     hand: Hand
     grasp: Grasps
@@ -64,11 +56,12 @@ class GraspTrial:
 
 
 class TrialDriver:
-    """A trial that was checked once, for any number of runs.
+    """A trial that is checked once and run any number of times.
 
-    The hand follows `reference`; None: that of the trial's hand and grasp. `obj_from_world` is the simulator's frame in
-    that of the grasp: the same, or upright on the trial's table. There all is rounded, so that a trial moved as a whole
-    is the same to the last bit.
+    Attributes:
+        reference: the closing of the hand; by default derived from the trial's hand and grasp.
+        obj_from_world: the simulator's frame in the grasp's frame; with a table it is upright on the table.
+            Poses in the simulator's frame are rounded, so that results are bitwise invariant to rigid motion.
 
     Raises:
         BadArgument, MeshError: as in `close_hand`.
@@ -77,7 +70,7 @@ class TrialDriver:
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
     >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> TrialDriver(trial, TrialSpec(approach=0.0)).open().starts  # nothing overlaps
+    >>> TrialDriver(trial, TrialSpec(approach=0.0)).open().starts
     True
     """
 
@@ -154,10 +147,7 @@ class TrialDriver:
 
 
 def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingReference:
-    """Return what a trial's hand follows; closing "paper" takes its forces from the stability model [6].
-
-    A hand without such a model presses with analytic forces (`ClosingReference.gains.force_source`).
-    """
+    """Return the closing of a trial's hand; closing "paper" takes its forces from the stability model [6], if any."""
     stability = None
     if spec.closing == "paper":
         from torchgrasp.control.paper.stability import load_stability
@@ -168,19 +158,7 @@ def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingRefer
 
 
 class TrialRun:
-    """One run of a trial in a fresh scene; its phases yield after every control tick.
-
-    >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
-    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> run = TrialDriver(trial, TrialSpec(closing="open_loop")).open()
-    >>> len(list(run.approach())), len(list(run.close())) > 10  # ticks
-    (50, True)
-    >>> run.step()
-    >>> run.strained(), run.robot.force > 0.1
-    (False, array([ True,  True,  True]))
-    """
+    """One run of a trial in a fresh scene; its phases yield after every control tick."""
 
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial
@@ -195,7 +173,7 @@ class TrialRun:
 
     @property
     def starts(self) -> bool:
-        """Whether no more overlaps than the trial allows."""
+        """Whether the overlap at the start is within the trial's limit."""
         return self.overlap <= self.spec.overlap
 
     def approach(self) -> Iterator[None]:
@@ -217,7 +195,7 @@ class TrialRun:
             yield
 
     def close(self) -> Iterator[None]:
-        """Close the fingers and press, until the hand counts as closed."""
+        """Close the fingers and press until the closing ends."""
         self.observation = self.robot.tick(self.controller.targets)
         yield
         while not self.controller.closed:
@@ -234,30 +212,26 @@ class TrialRun:
 
     @property
     def felt(self) -> tuple[float, float]:
-        """Friction that is believed, and load that is felt [N], NaN without the holding "grip"."""
+        """Estimated friction and load [N]; NaN without the holding "grip"."""
         hold = self.controller.hold
         return (hold.friction.mean, hold.weight) if isinstance(hold, GripHold) else (math.nan, math.nan)
 
     def strained(self) -> bool:
-        """Return whether some drive is at its largest torque."""
+        """Return whether a drive is at its torque limit."""
         reference = self.robot.reference
         effort = torch.tensor([reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names])
         return bool((reference.kp * (self.controller.targets.joints - self.observation.joints).abs() >= effort).any())
 
 
 def smooth_step(time: float) -> tuple[float, float]:
-    """Return place and speed of a motion from rest at 0 to rest at 1.
-
-    >>> smooth_step(0.5)
-    (0.5, 1.5)
-    """
+    """Return position and speed of a smooth motion from 0 to 1."""
     return time * time * (3 - 2 * time), 6 * time * (1 - time)
 
 
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return `obj_from_world`: z up from a table at z = 0, the hand above the origin, x along the hand's x axis.
+    """Return `obj_from_world`: the table at z = 0, the hand above the origin, x along the hand's x axis.
 
-    A hand whose x axis is steeper than 60 degrees gives its y axis.
+    Where the hand's x axis is steeper than 60 degrees, x is along its y axis.
     """
     z, origin = unit(table.normal.double()), obj_from_hand[:3, 3]
     level = [axis - (axis @ z) * z for axis in obj_from_hand[:3, :2].unbind(-1)]
@@ -266,7 +240,7 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
 
 
 def _to_world(grasp: Grasps, obj_from_world: Float[Tensor, "4 4"]) -> Grasps:
-    """Return a grasp in the simulator's frame, rounded: lengths to `GRID`, directions finer."""
+    """Return a grasp in the simulator's frame, its lengths rounded to `GRID`."""
     world_from_obj = inverse(obj_from_world)
 
     def turn(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
@@ -295,5 +269,5 @@ def _moved(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "tr
 
 
 def _by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:
-    """Return every joint of the URDF [rad] by name."""
+    """Return all joints of the URDF [rad] by name."""
     return {name: float(q) for name, q in hand.expand(joints).items()}

@@ -1,4 +1,4 @@
-"""Campaigns: workers plan on every view, keep the grasps as files, then put every grasp to a protocol."""
+"""Evaluation of a folder of objects: workers plan on all views, keep the grasps as files, and try them."""
 
 import contextlib
 import dataclasses
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 from torchgrasp.checks import Range, checked
-from torchgrasp.data import list_entries, list_views
+from torchgrasp.data.manifest import read_entries
 from torchgrasp.errors import DatasetError, Status
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
@@ -20,7 +20,7 @@ from torchgrasp.jobs import run_tasks
 from torchgrasp.values import load_grasps
 
 PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0
-"""Wall time [s] after which planning on a view, and an attempt, are ended: many times the usual."""
+"""Limits of the wall time [s] of planning on a view and of an attempt."""
 
 
 @checked
@@ -35,14 +35,15 @@ def evaluate(
 ) -> Generator[ViewScore, None, None]:
     """Plan on every view of a folder of objects, and yield each view's score.
 
-    Only the simulator knows the true mesh. An object with bad files or a bad entry is refused; the others go on.
+    Only the simulator knows the true mesh. An object with bad files or a bad entry is refused.
 
     Args:
         objects: a folder as in `torchgrasp.data`.
-        protocol: itself, or its name in `PROTOCOLS`.
-        spec: which grasps; None: `EvaluationSpec()`.
-        folder: where the executable grasps of each view are kept, OBJECT/VIEW.safetensors; None: nowhere. No other
-            run may write it meanwhile.
+        hand: the hand that grasps.
+        protocol: a protocol or its name in `PROTOCOLS`.
+        spec: views and grasps; None: `EvaluationSpec()`.
+        folder: for the executable grasps of each view, OBJECT/VIEW.safetensors; None: a temporary folder. No other
+            run may write to it at the same time.
         workers: processes (`run_tasks`); the scores do not depend on their number.
 
     Raises:
@@ -62,14 +63,13 @@ def evaluate(
     """
     protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
     views, refused = [], []
-    for name in list_entries(objects, spec.only):
-        try:
-            found = list_views(objects, spec.complete, [name], spec.views)
-        except DatasetError as error:
-            note = " ".join(str(error).split())
+    for name, entry in read_entries(objects, spec.only).items():
+        if isinstance(entry, DatasetError):
+            note = " ".join(str(entry).split())
             refused.append(ViewScore(ascii(name), "", 0, math.nan, refusal=Status.BAD_OBJECT, note=note))
         else:
-            views += [_View(Path(objects), *x, hand.source) for x in found]
+            names = entry.list_views(spec.complete, spec.views)
+            views += [_View(Path(objects), name, view, hand.source) for view in names]
     return _evaluate(views, refused, protocol, spec, folder, workers)
 
 
@@ -102,7 +102,7 @@ def _evaluate(
 
 @contextlib.contextmanager
 def _shelf(folder: Path | None, planned: bool) -> Iterator[Path]:
-    """Hold the folder of grasps; those of an earlier call are only read."""
+    """Hold the folder of grasps; the grasps of an earlier call are only read."""
     if folder is None:
         with temporary_folder() as temporary:
             yield temporary
@@ -115,7 +115,7 @@ def _shelf(folder: Path | None, planned: bool) -> Iterator[Path]:
 
 @dataclasses.dataclass(frozen=True)
 class _View(View):
-    """A view whose grasps are kept below the folder `shelf`."""
+    """A view and the folder of grasps."""
 
     shelf: Path = Path()
 
@@ -125,7 +125,7 @@ class _View(View):
 
 
 def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
-    """Plan on a view and keep the grasps, or count those of an earlier call."""
+    """Plan on a view and keep the grasps, or count the grasps of an earlier call."""
     found = plan_view(view, friction, spec, view.file if spec.planned else None)
     if found.grasps is not None and not spec.planned:
         meta = found.grasps.meta | {REFUSAL: found.score.refusal.name}
@@ -134,5 +134,5 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
 
 
 def _try(view: _View, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
-    """Try one of the grasps that were kept."""
+    """Try one of the kept grasps."""
     return try_grasp(view, load_grasps(view.file)[row], protocol, spec, (row, draw))
