@@ -14,8 +14,7 @@ from torch import Tensor
 from torchgrasp.checks import check_moved, show
 from torchgrasp.errors import BadArgument, FailedRows, Status
 
-FINGERTIPS = (3, 5)
-"""Fewest and most fingertips on an object: two contacts do not resist a rotation about their line."""
+FINGERTIPS = (3, 5)  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
 
 SomeValue = TypeVar("SomeValue", bound="Value")
 SomeBatch = TypeVar("SomeBatch", bound="Batch")
@@ -210,11 +209,7 @@ def check_device(name: str, found: torch.device, beside: str, wanted: torch.devi
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Count the rows of each status, the most frequent first.
-
-    >>> count_status(torch.tensor([0, 13, 0]))
-    {<Status.OK: 0>: 2, <Status.NOT_CLOSED: 13>: 1}
-    """
+    """Count the rows of each status, the most frequent first."""
     codes, counts = torch.unique(status, return_counts=True)
     pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))
     return {Status(code): count for code, count in pairs}

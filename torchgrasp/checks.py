@@ -35,8 +35,7 @@ from torchgrasp.marks import (  # noqa: F401
 # isort: on
 
 Checked = TypeVar("Checked", bound=Callable[..., Any])
-_thread = threading.local()
-"""`inside` is True while this thread is in a checked function."""
+_thread = threading.local()  # `inside` is True while this thread is in a checked function
 
 
 @dataclasses.dataclass
@@ -80,13 +79,6 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
 
     Raises:
         BadArgument: when called: an argument of another type, shape, dtype or range, or a number that is not finite.
-
-    >>> @checked
-    ... def double(n: Count) -> int:
-    ...     return 2 * n
-    >>> double(0)
-    Traceback (most recent call last):
-    torchgrasp.errors.BadArgument: n: expected a whole number in [1, 1000000], got 0
     """
     if thing is None:
         return functools.partial(checked, gradients=gradients)
@@ -293,13 +285,7 @@ class _ByName(type):
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return a finite floating tensor of a shape (None: any length); raise `BadArgument` otherwise.
-
-    >>> check_tensor("points", torch.zeros(5, 2), (None, 3))
-    Traceback (most recent call last):
-        ...
-    torchgrasp.errors.BadArgument: points: expected shape _ x 3, got shape (5, 2)
-    """
+    """Return a finite floating tensor of a shape (None: any length); raise `BadArgument` otherwise."""
     call = _Call(gradients=True)
     _read_tensor(name, value, Float[Tensor, " ".join("_" if s is None else str(s) for s in shape)], call)
     call.check_numbers()

@@ -44,9 +44,6 @@ def run_tasks(
         BadArgument: workers outside [0, 1024], or a limit below 1 ms.
         MissingExtra: pebble is not installed.
         Exception: the error of a task, when its turn comes.
-
-    >>> list(run_tasks(pow, [(2, 3), (3, 2)], workers=0))
-    [8, 9]
     """
     return _in_order(function, tasks, workers, limit) if workers else _run_here(function, tasks)
 

@@ -34,8 +34,7 @@ ANY, FINITE = "any number, NaN and infinity too", "finite numbers in every field
 """Marks of annotations. Tensors must be finite, unless marked `ANY`; `FINITE` asks so of all fields of a value."""
 RIGID = "a rigid transform: a right-handed rotation, and the row 0 0 0 1"
 """The mark of transforms: a matrix that scales or mirrors would give wrong results without an error."""
-LEAST, MOST = sys.float_info.min, sys.float_info.max
-"""Least positive and largest finite number."""
+LEAST, MOST = sys.float_info.min, sys.float_info.max  # least positive and largest finite number
 Seed = Annotated[int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")]
 """A seed of random draws."""
 Count = Annotated[int, Range(1, 1_000_000)]
@@ -127,11 +126,7 @@ def check_dense(name: str, value: Tensor, gradients: bool) -> None:
 
 
 def show(value: Any) -> str:
-    """Describe a wrong value: numbers and texts as they are, tensors by shape, others by their type.
-
-    >>> show("x" * 100)[-6:], show([1]), show(None)
-    ('xxx...', 'list', 'None')
-    """
+    """Describe a wrong value: numbers and texts as they are, tensors by shape, others by their type."""
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
     if value is None or isinstance(value, str | int | float):
@@ -142,11 +137,7 @@ def show(value: Any) -> str:
 
 
 def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Return which matrices are a right-handed rotation, up to rounding in float32 or in a text, and a translation.
-
-    >>> is_rigid(torch.stack([torch.eye(4), -torch.eye(4), torch.zeros(4, 4)])).tolist()
-    [True, False, False]
-    """
+    """Return which matrices are a right-handed rotation, up to rounding in float32 or in a text, and a translation."""
     x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
     rotation, eye = torch.stack([x, y, z], -2), torch.eye(4, dtype=torch.float64, device=a_from_b.device)
     error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
@@ -155,13 +146,7 @@ def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
 
 
 def check_moved(*args: Any, **kwargs: Any) -> None:
-    """Raise `BadArgument` for arguments that `Tensor.to` does not take, and for other devices or dtypes than ours.
-
-    >>> check_moved(torch.int32)
-    Traceback (most recent call last):
-        ...
-    torchgrasp.errors.BadArgument: to: expected a device, torch.float32 or torch.float64, got torch.int32
-    """
+    """Raise `BadArgument` for arguments that `Tensor.to` does not take, and for other devices or dtypes than ours."""
     given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
     allowed = "a device, torch.float32 or torch.float64"
     try:
@@ -173,12 +158,7 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
 
 
 def check_path(name: str, path: Path | str) -> None:
-    """Raise `BadArgument` for a path that no file can have: a NUL, half a character, names or paths that are too long.
-
-    >>> check_path("out", "a" * 300)
-    Traceback (most recent call last):
-    torchgrasp.errors.BadArgument: out: expected a path with names of at most 255 bytes, got a name of 300 bytes
-    """
+    """Raise `BadArgument` for a path that no file can have: a NUL, half a character, or too long."""
     try:
         raw = os.fsencode(path)
     except UnicodeEncodeError as error:

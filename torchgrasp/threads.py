@@ -11,8 +11,7 @@ import torch
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _lock = threading.Lock()
-_here = threading.local()
-"""`inside` is True in a thread that is within `one_thread`."""
+_here = threading.local()  # `inside` is True in a thread that is within `one_thread`
 _state = {"calls": 0, "before": 1}
 """How many threads are within `one_thread`, and the number of torch's threads before the first of them."""
 

@@ -12,8 +12,7 @@ from torchgrasp.errors import BadArgument, MissingExtra, Status
 
 Result = TypeVar("Result")
 
-CONNECTING = "30s"
-"""Longest time for the scheduler to answer."""
+CONNECTING = "30s"  # longest time for the scheduler to answer
 
 
 def run_on_cluster(

@@ -9,8 +9,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.views import EvaluationSpec
 
-LONGEST_LICENCE = 100
-"""Letters of a licence's name; those of the SPDX list have at most 40."""
+LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list have at most 40
 
 
 @checked

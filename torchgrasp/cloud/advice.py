@@ -16,8 +16,7 @@ from torchgrasp.values import PointCloud
 
 MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
 """Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""
-FEWEST = 50
-"""Fewest points that show whether a camera is right, or whether pixels fly off rims."""
+FEWEST = 50  # fewest points that show whether a camera is right, or whether pixels fly off rims
 
 
 @dataclasses.dataclass(frozen=True)

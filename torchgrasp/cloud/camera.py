@@ -19,8 +19,7 @@ from torchgrasp.values import PointCloud
 if TYPE_CHECKING:
     import trimesh
 
-WIDTH, HEIGHT, FOCAL = 640, 480, 616.0
-"""Columns, rows and focal length [px] of the default camera."""
+WIDTH, HEIGHT, FOCAL = 640, 480, 616.0  # columns, rows and focal length [px] of the default camera
 INTRINSICS = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64)
 """Intrinsics [px] of the default camera."""
 
@@ -185,11 +184,6 @@ def render_depth(
     Raises:
         BadArgument: a pose that is not rigid.
         MeshError: a mesh has no faces.
-
-    >>> import trimesh
-    >>> depth, labels = render_depth([trimesh.creation.box([0.1, 0.1, 0.1])], look_at(30.0, 40.0))
-    >>> depth.shape, labels.unique()
-    (torch.Size([480, 640]), tensor([0, 1]))
     """
     pose = check_rigid("camera_pose", camera_pose).double()
     depth = torch.full((HEIGHT, WIDTH), torch.inf, dtype=torch.float64)

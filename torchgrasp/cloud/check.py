@@ -12,8 +12,7 @@ from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.values import PointCloud
 
-MIN_POINTS = 4
-"""Fewest distinct points from which a surface can be estimated."""
+MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated
 
 
 @checked

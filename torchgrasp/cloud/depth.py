@@ -19,10 +19,8 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.limits import CLOUD_BYTES
 from torchgrasp.values import PointCloud
 
-MAX_SHIFT = 0.15
-"""Largest distance of the principal point from the image's middle, in sides of the image."""
-MAX_DEPTH = 50.0
-"""Largest median depth [m]; no depth camera sees so far."""
+MAX_SHIFT = 0.15  # largest distance of the principal point from the image's middle, in sides of the image
+MAX_DEPTH = 50.0  # largest median depth [m]; no depth camera sees so far
 
 
 @checked

@@ -18,8 +18,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
-MEASURED = 50_000
-"""Most points at which spacing, noise and outliers are measured."""
+MEASURED = 50_000  # most points at which spacing, noise and outliers are measured
 
 
 @checked

@@ -15,16 +15,12 @@ from torchgrasp.errors import TooFewPoints
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
-LAYER = 0.004
-"""Half thickness [m] of a support's layer, for the noise of a depth camera at half a metre."""
-LEVEL = math.cos(math.radians(15))
-"""Least cosine between the vertical and the normal of a level plane."""
+LAYER = 0.004  # half thickness [m] of a support's layer, for the noise of a depth camera at half a metre
+LEVEL = math.cos(math.radians(15))  # least cosine between the vertical and the normal of a level plane
 MIN_SUPPORT, STRAYS = 0.15, 0.02
 """Least share of the points in a support's layer; share of stray points, of which more lie above it and fewer below."""
-MIN_WIDTH = 0.05
-"""Least width [m] of a support; the side of a pen is narrower."""
-GAP = 0.04
-"""Least distance [m] between bodies; a bent or hidden surface of one body leaves smaller gaps."""
+MIN_WIDTH = 0.05  # least width [m] of a support; the side of a pen is narrower
+GAP = 0.04  # least distance [m] between bodies; a bent or hidden surface of one body leaves smaller gaps
 
 
 def find_support(

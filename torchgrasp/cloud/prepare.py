@@ -15,10 +15,8 @@ from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.geometry.linalg import fibonacci_sphere, unit
 from torchgrasp.values import PointCloud
 
-FACING = 0.9
-"""Least share of a view's normals that face the camera; noise turns some at the rim."""
-MAX_POINTS = 2000
-"""Most points to which a shape is fitted: they bound the time of the selection."""
+FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
+MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time of the selection
 
 
 @checked

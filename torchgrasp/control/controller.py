@@ -30,8 +30,7 @@ Closing = OpenLoopClosing | PositionClosing | PaperClosing | UncertaintyClosing
 Period = Annotated[float, Range(1e-5, 1.0)]
 """Time [s] from one tick to the next."""
 
-CLOSING_TIME = 4.0
-"""Longest time [s] of closing before the hand presses with the contacts that it has."""
+CLOSING_TIME = 4.0  # longest time [s] of closing before the hand presses with the contacts that it has
 
 
 class GraspController:

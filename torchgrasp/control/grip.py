@@ -18,31 +18,19 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import low_pass
 from torchgrasp.errors import Status
 
-MIN_PUSH = 0.4
-"""Least normal force [N] of a finger: four standard deviations of its reading."""
+MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations of its reading
 
-PRIOR_STD, MIN_STD = 0.2, 0.03
-"""Standard deviation of the friction estimate at the start, and its least value."""
+PRIOR_STD, MIN_STD = 0.2, 0.03  # standard deviation of the friction estimate at the start, and its least value
 
-SLIDING = 0.008
-"""Speed [m/s] from which a fingertip counts as sliding."""
+SLIDING = 0.008  # speed [m/s] from which a fingertip counts as sliding
 
-FORCE_LAG = 0.03
-"""Time [s] of sliding until the filtered forces show the friction."""
+FORCE_LAG = 0.03  # time [s] of sliding until the filtered forces show the friction
 
-LIFTED = 0.35
-"""Load [N] from which the object counts as lifted."""
+LIFTED = 0.35  # load [N] from which the object counts as lifted
 
 
 class FrictionEstimate:
-    """Mean and standard deviation of the friction of all fingertips on the object.
-
-    >>> estimate = FrictionEstimate()
-    >>> for _ in range(10):
-    ...     estimate.update(ratio=0.5, force=3.0)
-    >>> round(estimate.mean, 1), estimate.std < 0.06
-    (0.5, True)
-    """
+    """Mean and standard deviation of the friction of all fingertips on the object."""
 
     def __init__(self) -> None:
         self.mean, self.std = 0.8, PRIOR_STD

@@ -8,11 +8,9 @@ from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.plan.forces import least_friction_forces
 
-MAX_FACTOR = 1.5
-"""Largest factor on the forces; it bounds the force if a sensor reads too little."""
+MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
 
-RAMP = 0.4
-"""Time [s] in which the forces rise to the desired forces."""
+RAMP = 0.4  # time [s] in which the forces rise to the desired forces
 
 
 class ForceHold:

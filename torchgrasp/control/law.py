@@ -12,20 +12,15 @@ from torchgrasp.geometry.linalg import cholesky, limit_norm, squared_mahalanobis
 POSITION_FLOOR = 0.005
 """Isotropic standard deviation [m] of Sigma_cov: errors of hand pose and joint zeros; it keeps Eq. (27) finite."""
 
-POSITION_RATE = 4.0
-"""Largest position gain [1/s]: alpha_p = POSITION_RATE * POSITION_FLOOR**2."""
+POSITION_RATE = 4.0  # largest position gain [1/s]: alpha_p = POSITION_RATE * POSITION_FLOOR**2
 
-FORCE_BANDWIDTH = 15.0
-"""Bandwidth [rad/s] of the most certain force loop; the lag of the sensor's filter bounds it."""
+FORCE_BANDWIDTH = 15.0  # bandwidth [rad/s] of the most certain force loop; the lag of the sensor's filter bounds it
 
-FORCE_FLOOR = 0.3
-"""Isotropic standard deviation [N] of Sigma_fd: the tactile sensor's noise along the surface."""
+FORCE_FLOOR = 0.3  # isotropic standard deviation [N] of Sigma_fd: the tactile sensor's noise along the surface
 
-MAX_SPEED = 0.04
-"""Largest speed [m/s] of a fingertip."""
+MAX_SPEED = 0.04  # largest speed [m/s] of a fingertip
 
-MAX_STEP = 0.05
-"""Largest change [rad] of a joint in one tick; it bounds steps near a singular posture."""
+MAX_STEP = 0.05  # largest change [rad] of a joint in one tick; it bounds steps near a singular posture
 
 
 def surface_covariance(normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:

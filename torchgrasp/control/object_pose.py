@@ -17,8 +17,7 @@ from torchgrasp.geometry.linalg import unit
 TURNS, FINE_TURNS = (-0.24, -0.12, 0.0, 0.12, 0.24), (-0.06, 0.0, 0.06)
 """Turns [rad] of the object that `Localization` tries, and turns about the best of them."""
 
-PITCH = 0.004
-"""Distance [m] between the displacements that `Localization` tries."""
+PITCH = 0.004  # distance [m] between the displacements that `Localization` tries
 
 
 class ContactPlanes:

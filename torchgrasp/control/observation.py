@@ -12,8 +12,7 @@ from torchgrasp.checks import checked
 from torchgrasp.control.tactile import TactileState
 from torchgrasp.hand.hand import Hand
 
-STILL = torch.zeros(3, dtype=torch.float64)
-"""Displacement of a palm that stays on its path."""
+STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays on its path
 
 
 class Targets(NamedTuple):

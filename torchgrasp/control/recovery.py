@@ -21,14 +21,12 @@ from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
 SPEED, CAREFUL_SPEED, ACCELERATION = 0.2, 0.08, 1.0
 """Largest speed [m/s] of the approach, largest speed [m/s] after a touch, and acceleration [m/s^2]."""
 
-PRESSING_TIME = 0.5
-"""Time [s] from the end of closing until the hand counts as closed, and is judged."""
+PRESSING_TIME = 0.5  # time [s] from the end of closing until the hand counts as closed, and is judged
 
 MISPLACED = 0.008
 """Distance [m] between object and palm from which the hand closes again: twice the error of `Localization`."""
 
-OPENING_TIME = 0.5
-"""Time [s] in which the fingers open."""
+OPENING_TIME = 0.5  # time [s] in which the fingers open
 
 
 def can_guard(reference: ClosingReference) -> bool:

@@ -29,8 +29,7 @@ from torchgrasp.errors import BadArgument
 WAITING_FORCE = 0.3
 """Largest force [N] of a finger that waits for the others, and the force that stands for a binary contact."""
 
-TORQUE_NOISE = 0.01
-"""Standard deviation [N m] of a sensed joint torque."""
+TORQUE_NOISE = 0.01  # standard deviation [N m] of a sensed joint torque
 
 
 @checked

@@ -12,17 +12,13 @@ from torchgrasp.base import FINGERTIPS, Value, check_device
 from torchgrasp.checks import ANY, Count, Range, checked
 from torchgrasp.geometry.linalg import unit
 
-SAMPLING_RATE = 100.0
-"""Samples of a fingertip a second [Hz]."""
+SAMPLING_RATE = 100.0  # samples of a fingertip a second [Hz]
 
-NOISE = 0.1
-"""Standard deviation [N] of the normal force (Sec. 6.5)."""
+NOISE = 0.1  # standard deviation [N] of the normal force (Sec. 6.5).
 
-FLAG_CUTOFF = 5.0
-"""Cut-off [Hz] of the average force behind the contact flag."""
+FLAG_CUTOFF = 5.0  # cut-off [Hz] of the average force behind the contact flag
 
-TOUCH_ON = 0.2
-"""Average force [N] at which the contact flag turns on; it turns off at half of this force."""
+TOUCH_ON = 0.2  # average force [N] at which the contact flag turns on; it turns off at half of this force
 
 
 @checked

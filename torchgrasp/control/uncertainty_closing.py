@@ -15,17 +15,13 @@ from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.sensing import WAITING_FORCE, DriveFeel
 from torchgrasp.geometry.linalg import limit_norm
 
-PATIENCE = 2.5
-"""Longest time [s] from the first touch until the closing ends, even if some finger has not touched."""
+PATIENCE = 2.5  # longest time [s] from the first touch until the closing ends, even if some finger has not touched
 
-QUICK_TOUCH = 0.45
-"""Reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on."""
+QUICK_TOUCH = 0.45  # reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on
 
-PALM_SPEED = 0.04
-"""Largest speed [m/s] of the palm that follows the object."""
+PALM_SPEED = 0.04  # largest speed [m/s] of the palm that follows the object
 
-STALLED = 0.25
-"""Force [N] of its drives at which a finger without a sensor counts as touching."""
+STALLED = 0.25  # force [N] of its drives at which a finger without a sensor counts as touching
 
 LEAD = 0.04
 """Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link that is blocked."""

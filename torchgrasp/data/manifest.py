@@ -27,14 +27,11 @@ from torchgrasp.values import PointCloud
 if TYPE_CHECKING:
     import trimesh
 
-WHOLE = "whole"
-"""Name of the view that shows an object from all sides, with normals: `full_normals.ply`."""
+WHOLE = "whole"  # name of the view that shows an object from all sides, with normals: `full_normals.ply`
 MOST_SCALE, MOST_METRES, MOST_MASS = 1e4, 1e4, 1e4
 """Largest scale, its inverse being the least, largest coordinate [m] of a camera, and largest mass [kg]."""
-LONGEST_NAME = 100
-"""Most letters of a name: file names have 255 bytes."""
-MESHES = (".ply", ".stl", ".obj", ".off")
-"""Suffixes of the meshes that `write_objects` takes from a folder."""
+LONGEST_NAME = 100  # most letters of a name: file names have 255 bytes
+MESHES = (".ply", ".stl", ".obj", ".off")  # suffixes of the meshes that `write_objects` takes from a folder
 ELEVATION, DISTANCE = (25.0, 45.0), 0.5
 """Of a rendered view: angle above the horizontal [deg], uniform, and distance [m], as of a camera on a robot's arm."""
 

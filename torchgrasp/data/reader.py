@@ -19,12 +19,9 @@ from torchgrasp.errors import ModelFileError
 from torchgrasp.files import Field, Recent, read_json
 from torchgrasp.values import Grasps, PointCloud
 
-CARD = "card.json"
-"""File that describes a data set; it is written last, so a folder that has one is whole."""
-MOST_CARD = 256 * 1024 * 1024
-"""Most bytes of a card: a million jobs take 250 each."""
-KEPT = 32
-"""Shards that stay in memory: of 64 jobs with 20 grasps each one takes 3 MB, mostly clouds."""
+CARD = "card.json"  # file that describes a data set; it is written last, so a folder that has one is whole
+MOST_CARD = 256 * 1024 * 1024  # most bytes of a card: a million jobs take 250 each
+KEPT = 32  # shards that stay in memory: of 64 jobs with 20 grasps each one takes 3 MB, mostly clouds
 
 
 class ShardJob(NamedTuple):

@@ -17,12 +17,9 @@ from torchgrasp.files import Field, pack_tensors, read_value
 from torchgrasp.limits import JSON_LETTERS
 from torchgrasp.values import Grasps, check_grasps
 
-KIND = "grasp-shard"
-"""Kind of the file."""
-MOST = 1_000_000
-"""Most points, grasps and tries of one job."""
-LONGEST_META = 10_000
-"""Letters of an entry of a grasp's metadata: the names of all joints are one."""
+KIND = "grasp-shard"  # kind of the file
+MOST = 1_000_000  # most points, grasps and tries of one job
+LONGEST_META = 10_000  # letters of an entry of a grasp's metadata: the names of all joints are one
 
 
 class JobRow(NamedTuple):

@@ -20,8 +20,7 @@ __all__ = ["GraspObject", "list_objects", "load_object", "load_scene", "load_shi
 DATA = Path(__file__).parent / "assets"
 """Folder of the objects: `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`."""
 
-SCENE = DATA / "scene.npz"
-"""A depth image of the objects on a table, with labels, camera and table."""
+SCENE = DATA / "scene.npz"  # a depth image of the objects on a table, with labels, camera and table
 
 MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
 """Masses [kg]: a tin, a plastic jug, a plush rabbit, a bottle a third full."""

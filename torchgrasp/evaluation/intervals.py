@@ -14,8 +14,7 @@ from torch import Tensor
 
 from torchgrasp.checks import Measured, Seed, checked
 
-RESAMPLES = 10_000
-"""Number of resamples behind an interval."""
+RESAMPLES = 10_000  # number of resamples behind an interval
 
 Counts = Mapping[str, tuple[int | float, int]]
 """Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and number of values."""
@@ -36,11 +35,7 @@ class Share(NamedTuple):
 
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
-    """Return the counts of outcomes, each with the name of its unit.
-
-    >>> count_by([("tin", True), ("cup", False), ("tin", False)])
-    {'tin': (1, 2), 'cup': (0, 1)}
-    """
+    """Return the counts of outcomes, each with the name of its unit."""
     counts: dict[str, tuple[int, int]] = {}
     for name, passed in outcomes:
         before = counts.get(name, (0, 0))
@@ -54,11 +49,6 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
     Where all trials passed, or none, the bootstrap has no width. The interval is then the one-sided 95 % bound of n
     independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
-
-    >>> share_over({"tin": (9, 10), "cup": (5, 10), "jug": (8, 10)})[::3]
-    (0.7333333333333333, 30)
-    >>> round(share_over({"tin": (2, 2), "cup": (3, 3)}).low, 2)
-    0.22
     """
     found = contrast_over([counts], [1.0], seed)
     if found.units > 1 and found.value in (0.0, 1.0):
@@ -69,11 +59,7 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
 @checked
 def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
-    """Return the mean of numbers, each with the name of its unit, with its interval; NaN values do not count.
-
-    >>> mean_over([("tin", 1.0), ("cup", 3.0), ("tin", 2.0)])[::3]
-    (2.0, 3)
-    """
+    """Return the mean of numbers, each with the name of its unit, with its interval; NaN values do not count."""
     sums: dict[str, tuple[float, int]] = {}
     for name, value in values:
         if not math.isnan(value):
@@ -87,9 +73,6 @@ def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
     """Return the first share minus the second share, paired by unit.
 
     An interval of zero width means that the units agree, not that the difference is exact.
-
-    >>> difference_over({"tin": (4, 4), "cup": (4, 4)}, {"tin": (2, 4), "cup": (1, 4)})
-    Share(value=0.625, low=0.5, high=0.75, total=8, units=2)
     """
     return contrast_over([first, second], [1.0, -1.0], seed)
 
@@ -99,11 +82,6 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
     """Return a weighted sum of shares over the same resampled units.
 
     `total` counts the trials of the first column. Resamples without a trial in some column do not count.
-
-    >>> new, old = {"tin": (4, 4), "cup": (4, 4)}, {"tin": (2, 4), "cup": (1, 4)}
-    >>> found = contrast_over([new, old], [1.0, -1.0])
-    >>> found.value, found.low <= found.value <= found.high
-    (0.625, True)
     """
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
     total = sum(total for _, total in columns[0].values())
@@ -128,13 +106,7 @@ def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[T
 
 @checked
 def format_share(share: Share, unit: str = "families") -> str:
-    """Return a share in words.
-
-    >>> format_share(Share(0.938, 0.888, 0.965, 480, 8))
-    '93.8 % [88.8, 96.5] of 480, 8 families'
-    >>> format_share(Share(0.5, math.nan, math.nan, 4, 1))
-    '50.0 % of 4, one of the families: no interval'
-    """
+    """Return a share in words."""
     if math.isnan(share.value):
         return "nothing measured"
     value = f"{100 * share.value:.1f} %"

@@ -25,16 +25,11 @@ from torchgrasp.values import Grasps
 if TYPE_CHECKING:
     import trimesh
 
-LIFT_TIME = 1.0
-"""Time [s] in which the hand rises."""
-SHAKE_RATE = 5.0
-"""Frequency of the shaking [Hz]."""
-JUDGED_TIME = 0.2
-"""Time [s] at the end of a trial in which contacts are counted."""
-PUSHED_DISTANCE = 0.05
-"""Motion [m] of the object's centre during the closing that counts as ejected."""
-LOST_DISTANCE = 0.5
-"""Distance [m] of the object, beyond the lift, at which the trial ends."""
+LIFT_TIME = 1.0  # time [s] in which the hand rises
+SHAKE_RATE = 5.0  # frequency of the shaking [Hz]
+JUDGED_TIME = 0.2  # time [s] at the end of a trial in which contacts are counted
+PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre during the closing that counts as ejected
+LOST_DISTANCE = 0.5  # distance [m] of the object, beyond the lift, at which the trial ends
 SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
 """Motion [m, rad] of the object in the closed hand that counts as slipped."""
 

@@ -79,11 +79,9 @@ _FLOATING = TrialSpec(
 )  # fmt: skip
 """DexGraspBench's. PhysX resists torsion by friction x force x patch [m]: the ratio of both frictions."""
 
-_PULL = PullSpec(10.0, 2.0, 0.05, math.radians(15))
-"""DexGraspBench's."""
+_PULL = PullSpec(10.0, 2.0, 0.05, math.radians(15))  # DexGraspBench's
 
-POSE_NOISE = PoseNoise(0.005, math.radians(5))
-"""As large as in Get a Grip (CoRL 2024)."""
+POSE_NOISE = PoseNoise(0.005, math.radians(5))  # as large as in Get a Grip (CoRL 2024)
 
 PROTOCOLS = {
     protocol.name: protocol
@@ -136,11 +134,6 @@ def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]
 
     Raises:
         BadArgument: an error that is no finite (4, 4).
-
-    >>> error = torch.eye(4).double()
-    >>> error[0, 3] = 0.01  # the hand stands 10 mm off, along its own axis
-    >>> apply_error(torch.eye(4).double(), error)[:3, 3]
-    tensor([0.0100, 0.0000, 0.0000], dtype=torch.float64)
     """
     planned = obj_from_hand.to("cpu", torch.float64)
     return planned if error is None else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
@@ -151,9 +144,6 @@ def seed_of(seed: Seed, *names: str | int) -> int:
     """Return the seed of one draw: a hash of the campaign's seed and of what the draw is for.
 
     Draws for another object, view, row or repetition are independent, whatever else is drawn and in which order.
-
-    >>> seed_of(0, "jug", "view0", 3, 0) == seed_of(0, "jug", "view0", 3, 0) != seed_of(0, "cup", "view0", 3, 0)
-    True
     """
     digest = hashlib.sha256(json.dumps([seed, *names]).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
@@ -161,12 +151,7 @@ def seed_of(seed: Seed, *names: str | int) -> int:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Draw errors of the hand in its planned frame.
-
-    >>> errors = draw_hand_errors(PoseNoise(translation=0.005), 100, seed=0)
-    >>> errors.shape, bool((errors[:, :3, 3].abs() <= 0.005).all())
-    (torch.Size([100, 4, 4]), True)
-    """
+    """Draw errors of the hand in its planned frame."""
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
     drawn = 2 * torch.rand(count, 6, generator=generator, dtype=torch.float64) - 1
@@ -176,12 +161,7 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 
 @checked
 def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Draw poses of an object that moves on its table and turns about the vertical through `pivot` [m]; on the CPU.
-
-    >>> poses = draw_object_poses(PoseNoise(translation=0.005), torch.zeros(3).double(), 100, seed=0)
-    >>> poses[:, 2, 3].abs().max()  # it stays on the table
-    tensor(0., dtype=torch.float64)
-    """
+    """Draw poses of an object that moves on its table and turns about the vertical through `pivot` [m]; on the CPU."""
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
@@ -197,14 +177,7 @@ def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tens
 
 @checked
 def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed) -> Float[Tensor, "4 4"]:
-    """Draw the hand's error for one trial of a grasp, by a seed of its own (`seed_of`).
-
-    >>> from torchgrasp import load_object
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> grasp, mesh = load_shipped_grasp("jug", "barrett"), load_object("jug").mesh
-    >>> draw_error(find_protocol("paper"), grasp, mesh, seed=0)[:3, 3].norm() < 0.05  # [m]
-    tensor(True)
-    """
+    """Draw the hand's error for one trial of a grasp, by a seed of its own (`seed_of`)."""
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
     pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)

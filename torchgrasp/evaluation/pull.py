@@ -22,8 +22,7 @@ from torchgrasp.threads import single_threaded
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """-x, +x, -y, +y, -z, +z of the world."""
 
-CHECK_SECONDS = 0.2
-"""Interval [s] at which the pulled object's motion is checked."""
+CHECK_SECONDS = 0.2  # interval [s] at which the pulled object's motion is checked
 
 
 @checked
@@ -122,15 +121,7 @@ def run_protocol(
     rank: Annotated[int, Range(0, 1000000)] = 0,
     draw: Annotated[int, Range(0, 1000000)] = 0,
 ) -> ProtocolResult:
-    """Try one grasp under a protocol; see `pull_grasp` and `lift_grasp`.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.data.shipped import load_object, load_shipped_grasp
-    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
-    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> run_protocol(trial, find_protocol("paper")).passed
-    True
-    """
+    """Try one grasp under a protocol; see `pull_grasp` and `lift_grasp`."""
     started = time.process_time()
     driver = TrialDriver(trial, protocol.trial)
     overlap = driver.grasp_overlap()

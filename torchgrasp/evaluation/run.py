@@ -19,8 +19,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.jobs import run_tasks
 from torchgrasp.values import load_grasps
 
-PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0
-"""Limits of the wall time [s] of planning on a view and of an attempt."""
+PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0  # limits of the wall time [s] of planning on a view and of an attempt
 
 
 @checked

@@ -197,10 +197,6 @@ def judge(
 
     "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect predictions and 0
     for the base rate. "auc" is the area under the ROC curve. "error" is the expected calibration error over the "bins".
-
-    >>> found = judge(torch.tensor([0.15, 0.11, 0.9]), torch.tensor([False, True, True]), ["tin", "cup", "tin"])
-    >>> [(round(x.low, 1), round(x.predicted, 2), x.passed.value) for x in found["bins"]], found["auc"]
-    ([(0.1, 0.13, 0.5), (0.9, 0.9, 1.0)], 0.5)
     """
     outcome = passed.to(predicted)
     brier, rate, bins = float((predicted - outcome).square().mean()), outcome.mean(), _bins(predicted, passed, units)

@@ -35,8 +35,7 @@ if TYPE_CHECKING:
 
     Solid = trimesh.Trimesh | Path | str
 
-APPROACH_SPEED = 0.2
-"""Mean speed [m/s] of an unguarded approach."""
+APPROACH_SPEED = 0.2  # mean speed [m/s] of an unguarded approach
 
 
 @checked
@@ -65,13 +64,6 @@ class TrialDriver:
 
     Raises:
         BadArgument, MeshError: as in `close_hand`.
-
-    >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
-    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> TrialDriver(trial, TrialSpec(approach=0.0)).open().starts
-    True
     """
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:

@@ -30,10 +30,8 @@ from torchgrasp.values import Grasps, PointCloud, load_grasps
 if TYPE_CHECKING:
     import trimesh
 
-MOST_FRICTION = 1.0
-"""Largest friction that grasps are planned for, below the friction of some protocols."""
-REFUSAL = "refusal"
-"""Key of the metadata of saved grasps with the reason why a view has none."""
+MOST_FRICTION = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
+REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
 
 Ranks = Literal["best", "spread"]
 """Which grasps of a view are tried: the best, or as many spread over all ranks."""
@@ -82,11 +80,7 @@ class EvaluationSpec(Value):
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the ranks of the grasps that are tried.
-
-    >>> choose_rows(100, 5, "best"), choose_rows(100, 5, "spread"), choose_rows(3, 5, "spread")
-    ([0, 1, 2, 3, 4], [0, 25, 50, 74, 99], [0, 1, 2])
-    """
+    """Return the ranks of the grasps that are tried."""
     most = min(most, executable)
     if ranks == "best" or most < 2:
         return list(range(most))

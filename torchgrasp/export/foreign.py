@@ -30,12 +30,9 @@ from torchgrasp.plan.certify import certify
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, Grasps
 
-MOST_GRASPS = 100_000
-"""Most grasps of a file: more are no plan of one object."""
-UNIT = 1e-3
-"""Largest difference from 1 of a quaternion's length in a file of few digits."""
-FAR = 100.0
-"""Largest number of a pose or posture [m, rad] in a JSON file."""
+MOST_GRASPS = 100_000  # most grasps of a file: more are no plan of one object
+UNIT = 1e-3  # largest difference from 1 of a quaternion's length in a file of few digits
+FAR = 100.0  # largest number of a pose or posture [m, rad] in a JSON file
 
 Quaternion = Literal["wxyz", "xyzw"]
 

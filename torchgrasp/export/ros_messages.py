@@ -19,8 +19,7 @@ from torchgrasp.values import Grasps
 OBJECT_FRAME = "object"
 """Name of the object's frame in the messages: the frame of the cloud; publish a transform of that name."""
 
-DIGITS = 9
-"""Decimals of a number [nm, nrad]: YAML 1.1 takes 1e-05 for a text, so none has an exponent."""
+DIGITS = 9  # decimals of a number [nm, nrad]: YAML 1.1 takes 1e-05 for a text, so none has an exponent
 
 
 @checked

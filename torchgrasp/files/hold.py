@@ -12,8 +12,7 @@ from filelock import FileLock, Timeout
 from torchgrasp.errors import OutputError
 from torchgrasp.files.write import ENDING, write_file
 
-LOCK = ".lock"
-"""Name of the lock file in a folder. It holds the process and host of the run."""
+LOCK = ".lock"  # name of the lock file in a folder. It holds the process and host of the run.
 
 
 @contextlib.contextmanager

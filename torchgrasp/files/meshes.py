@@ -10,8 +10,7 @@ from typing import Any
 
 from torchgrasp.limits import MESH_FACES, PLY_HEADER_BYTES, PLY_PROPERTIES
 
-SUFFIXES = (".obj", ".off", ".ply", ".stl")
-"""Formats whose memory is bounded by the size of the file."""
+SUFFIXES = (".obj", ".off", ".ply", ".stl")  # formats whose memory is bounded by the size of the file
 
 _REFERENCE = re.compile(rb"/\S*")
 """Normal and texture of a corner in an .obj: a corner with two textures would become two, and open the surface."""

@@ -22,11 +22,9 @@ from torchgrasp.limits import LARGEST_NUMBER, TENSOR_FILE_BYTES
 Item = TypeVar("Item")
 SomeValue = TypeVar("SomeValue", bound=Value)
 
-VERSION = "1"
-"""Version of the file layout; readers refuse all others."""
+VERSION = "1"  # version of the file layout; readers refuse all others
 
-DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)
-"""Dtypes in our files."""
+DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)  # dtypes in our files
 
 
 def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
@@ -149,12 +147,7 @@ def _is_value(hint: Any) -> bool:
 
 
 class Recent(Generic[Item]):
-    """Keeps the last few items that were read, by number; a copy in another process begins empty.
-
-    >>> recent = Recent(1)
-    >>> recent.get(3, str), recent.get(3, hex), recent.get(4, str), recent.get(3, hex)
-    ('3', '3', '4', '0x3')
-    """
+    """Keeps the last few items that were read, by number; a copy in another process begins empty."""
 
     def __init__(self, most: int) -> None:
         self.most = most

@@ -13,8 +13,7 @@ from typing import IO, Any
 
 from torchgrasp.errors import OutputError, Status
 
-ENDING = ".part"
-"""Ending of the name under which a file is written; a dot and the name of the file come first."""
+ENDING = ".part"  # ending of the name under which a file is written; a dot and the name of the file come first
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
@@ -80,11 +79,7 @@ def sha256(path: Path | str) -> str:
 
 
 def format_json(value: Any) -> str:
-    """Return a value as JSON; a status becomes its name, NaN and infinity become null.
-
-    >>> format_json({"force": float("nan"), "status": Status.OK}).split()
-    ['{', '"force":', 'null,', '"status":', '"OK"', '}']
-    """
+    """Return a value as JSON; a status becomes its name, NaN and infinity become null."""
     return json.dumps(_plain(value), indent=1)
 
 
@@ -100,12 +95,7 @@ def _plain(value: Any) -> Any:
 
 
 def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) -> str:
-    """Return rows as lines of text; columns are flush right except those in `left`.
-
-    >>> print(format_columns([("object", "held"), ("tin", "4")], left={0}))
-    object  held
-    tin        4
-    """
+    """Return rows as lines of text; columns are flush right except those in `left`."""
     longest = [max(map(len, column)) for column in zip(*rows, strict=True)]
     widths = [-width if k in left else width for k, width in enumerate(longest)]
     return "\n".join(format_line(row, widths) for row in rows)

@@ -19,11 +19,7 @@ MIN_HEIGHT_RATIO = 1e-3
 
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the homogeneous transform of a rotation and a translation [m].
-
-    >>> rigid(torch.eye(3), torch.ones(3))[:3, 3]
-    tensor([1., 1., 1.])
-    """
+    """Return the homogeneous transform of a rotation and a translation [m]."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3]
     return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
@@ -54,11 +50,7 @@ def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the rotation by |v| radians about v (the exponential map), smooth at v = 0.
-
-    >>> torch.allclose(rotation_from_vector(torch.zeros(3)), torch.eye(3))
-    True
-    """
+    """Return the rotation by |v| radians about v (the exponential map), smooth at v = 0."""
     angle = torch.linalg.vector_norm(v, dim=-1)[..., None, None]
     turn, half = skew(v), torch.sinc(angle / (2 * math.pi))  # Rodrigues: sin x / x, and (1 - cos x) / x^2 = half^2 / 2
     identity = torch.eye(3, dtype=v.dtype, device=v.device)
@@ -66,11 +58,7 @@ def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
-    """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad].
-
-    >>> torch.round(rotation_from_rpy((0.0, 0.0, torch.pi / 2)))[0]
-    tensor([ 0., -1.,  0.], dtype=torch.float64)
-    """
+    """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad]."""
     (cr, cp, cy), (sr, sp, sy) = [math.cos(a) for a in rpy], [math.sin(a) for a in rpy]
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -95,11 +83,7 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
-    """Return all choices of `size` of the numbers below `count`, in their order.
-
-    >>> subsets(3, 2, torch.device("cpu")).tolist()
-    [[0, 1], [0, 2], [1, 2]]
-    """
+    """Return all choices of `size` of the numbers below `count`, in their order."""
     return torch.tensor(list(itertools.combinations(range(count), size)), device=device)
 
 
@@ -123,9 +107,6 @@ def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
 
     Raises:
         DegenerateContacts: a triangle is flatter than `MIN_HEIGHT_RATIO`.
-
-    >>> virtual_frame(torch.tensor([[0.0, 0, 0], [0, 1, 0], [1, 0, 0]])).shape
-    torch.Size([4, 4])
     """
     flat = degenerate(points)
     if bool(flat.any()):

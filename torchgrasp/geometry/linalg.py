@@ -10,8 +10,7 @@ from torch import Tensor
 
 from torchgrasp.errors import IndefiniteCovariance
 
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-"""Golden section of the full circle [rad]."""
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # golden section of the full circle [rad]
 
 
 def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
@@ -32,9 +31,6 @@ def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start:
         n: number of vectors.
         angle: rotation about z from one vector to the next [rad]: `GOLDEN_ANGLE`, in either sense.
         start: rotation of the first vector, in units of `angle`.
-
-    >>> fibonacci_sphere(4)[:, 2]
-    tensor([ 0.7500,  0.2500, -0.2500, -0.7500], dtype=torch.float64)
     """
     k = torch.arange(n, dtype=torch.float64)
     z = 1 - (2 * k + 1) / n
@@ -44,11 +40,7 @@ def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start:
 
 
 def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"]:
-    """Return vectors shortened to the length `longest` where they are longer.
-
-    >>> limit_norm(torch.tensor([3.0, 4.0]), 1.0)
-    tensor([0.6000, 0.8000])
-    """
+    """Return vectors shortened to the length `longest` where they are longer."""
     return v * (longest / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(longest))
 
 
@@ -57,9 +49,6 @@ def solve_least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]) 
 
     `torch.linalg.lstsq` is not used: on a processor it does not set its first column pivots, so the last digits differ
     from call to call.
-
-    >>> solve_least_squares(torch.tensor([[1.0], [1.0]]), torch.tensor([1.0, 3.0])).round(decimals=6)
-    tensor([2.])
     """
     return torch.linalg.pinv(rows) @ values
 
@@ -69,10 +58,6 @@ def cholesky(matrix: Float[Tensor, "*b n n"], what: str, remedy: str) -> Float[T
 
     Raises:
         IndefiniteCovariance: with the smallest eigenvalue and the `remedy`.
-
-    >>> cholesky(torch.eye(2), "I", "none needed")
-    tensor([[1., 0.],
-            [0., 1.]])
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not bool((info == 0).all() & torch.isfinite(factor).all()):  # one wait for the device
@@ -110,9 +95,6 @@ def farthest_points(
         tie: relative difference of distances that counts as none; of equally far points the first is taken.
         distance: the distance of each point from one of them.
         before: points that count as picked before, and are not returned; with any, `first` is not used.
-
-    >>> farthest_points(torch.tensor([[0.0], [1.0], [9.0]]), 2)
-    tensor([0, 2])
     """
     if distance is squared_distance and before is None and points.device.type == "cpu" and points.ndim == 2:
         return torch.from_numpy(_farthest_on_cpu(points.detach().numpy(), min(count, len(points)), first, tie))

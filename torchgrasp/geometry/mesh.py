@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     import trimesh
 
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
-LEAST_VOLUME = 1e-12
-"""Least volume [m^3] of a body."""
+LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
@@ -25,10 +24,6 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
         MeshError: no mesh in the file, another format than `SUFFIXES`, or more than `MESH_BYTES` or `MESH_FACES`;
             non-finite vertices, an open surface, faces that are not all turned outward, or no volume.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
-
-    >>> import trimesh
-    >>> len(read_mesh(trimesh.creation.box((0.1, 0.1, 0.1))).faces)
-    12
     """
     import trimesh
 
@@ -108,11 +103,6 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
         vertices: of shape (v, 3).
         faces: of shape (f, 3).
         values: the field at the vertices (v,).
-
-    >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    >>> kept, faces, cut = clip_mesh(corners, np.array([[0, 1, 2]]), np.array([-1.0, 1, -1]))
-    >>> sorted(kept[cut].tolist()), len(faces)
-    ([[0.5, 0.0, 0.0], [0.5, 0.5, 0.0]], 2)
     """
     keep = values < 0
     count = keep[faces].sum(1)

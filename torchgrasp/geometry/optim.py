@@ -15,12 +15,9 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, pick, put
 
-SOLVED = 0.1
-"""Sum of squared residuals at which a row of `LeastSquares` ends."""
-STALLED = 0.02
-"""Relative decrease of the sum of squares below which a row of `LeastSquares` has converged."""
-LOST = 30.0
-"""Damping beyond which a refused step ends a row of `LeastSquares`."""
+SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
+STALLED = 0.02  # relative decrease of the sum of squares below which a row of `LeastSquares` has converged
+LOST = 30.0  # damping beyond which a refused step ends a row of `LeastSquares`
 
 
 @dataclasses.dataclass(frozen=True)

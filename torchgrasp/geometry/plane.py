@@ -164,13 +164,7 @@ def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
 
 def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value of `torchgrasp.values` in frame b [m]; it is given in frame a.
-
-    >>> import torchgrasp
-    >>> up = torch.eye(4).index_put((torch.tensor(2), torch.tensor(3)), torch.tensor(1.0))
-    >>> move(torchgrasp.PointCloud(torch.zeros(4, 3)), up).points[0]
-    tensor([0., 0., 1.])
-    """
+    """Return a value of `torchgrasp.values` in frame b [m]; it is given in frame a."""
 
     def moved(name: str, x: Any) -> Any:
         if isinstance(x, Value):

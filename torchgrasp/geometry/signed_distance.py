@@ -18,10 +18,8 @@ BAND = 0.026
 """Distance [m] from the surface within which every second node is exact: the reach of a palm's collision spheres."""
 NEAR, INWARD = 3, 5
 """Spacings from the surface, outside and inside, within which every node is exact; other nodes are interpolated."""
-FAR_SHARE = 8
-"""One of so many samples of the surface is used for nodes beyond the band."""
-FIELD_SPACING = 0.004
-"""Spacing [m] of nodes with an error below that of an estimated surface."""
+FAR_SHARE = 8  # one of so many samples of the surface is used for nodes beyond the band
+FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
 
 
 @checked
@@ -92,12 +90,6 @@ def field_from_surface(
 
     Raises:
         BadArgument: wrong shapes, faces that name no vertex or have no area, or a grid of more than 2e7 nodes.
-
-    >>> from torchgrasp import load_object
-    >>> mesh = load_object("cylinder").mesh
-    >>> field = field_from_surface(torch.tensor(mesh.vertices), torch.tensor(mesh.faces), spacing=0.01)
-    >>> field.query(torch.tensor(mesh.center_mass))[0] < -0.02  # [m]: inside
-    tensor(True)
     """
     check_tensor("vertices", vertices, (None, 3))
     if not 1e-4 <= spacing <= 0.1 or not 0 <= margin <= 1:

@@ -26,14 +26,10 @@ from torchgrasp.limits import HAND_SEPARATIONS, HAND_SHAPE_PAIRS
 
 FINGER_CELL, PALM_CELL = 0.015, 0.022
 """Edge of the cells of fingers and palm [m]; edges and corners stick farther out of the spheres of larger cells."""
-SINGLE_LAYER = 0.025
-"""A shape thinner than this [m] has one layer of cells across."""
-BULGE = 0.004
-"""How far a sphere may stand out of a shape's faces [m], other than a fingertip's."""
-MEETING_DISTANCE = 0.002
-"""Links that come nearer than this [m] in some posture are a pair to test."""
-ALWAYS = 0.98
-"""Links that overlap in a larger share of the postures overlap by construction: they are no pair to test."""
+SINGLE_LAYER = 0.025  # a shape thinner than this [m] has one layer of cells across
+BULGE = 0.004  # how far a sphere may stand out of a shape's faces [m], other than a fingertip's
+MEETING_DISTANCE = 0.002  # links that come nearer than this [m] in some posture are a pair to test
+ALWAYS = 0.98  # links that overlap in a larger share of the postures overlap by construction: they are no pair to test
 
 
 @dataclasses.dataclass(frozen=True)

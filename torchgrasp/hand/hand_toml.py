@@ -19,8 +19,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-SUPPORTED = "three to five different fingers"
-"""Fingers of a grasp, see `FINGERTIPS`."""
+SUPPORTED = "three to five different fingers"  # fingers of a grasp, see `FINGERTIPS`
 
 _DOTTED = re.compile(
     r"""(?<![\w"'-])(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}"""

@@ -17,8 +17,7 @@ IGNORED = {"material", "transmission", "gazebo", "ros2_control", "mujoco", "sens
 """Elements of a robot, besides links and joints, that are left out."""
 NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 """A decimal number; Python also reads 1_0, digits outside ASCII, and nan."""
-SHAPES = ("box", "cylinder", "sphere", "mesh")
-"""Collision shapes of a URDF."""
+SHAPES = ("box", "cylinder", "sphere", "mesh")  # collision shapes of a URDF
 PARTS = {
     "robot": ("link", "joint"),
     "link": ("inertial", "collision"),

@@ -117,18 +117,7 @@ def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
 
 @checked
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp on fixed contacts for each row with seeds, best first; up to six seeds of a row are tried.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    >>> middle = grasp.contacts.points[0].mean(0)
-    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle)
-    >>> seeds = nearest_postures(PostureLibrary.of(hand, 1000), grasp.contacts, problem.world)
-    >>> bool(solve_contact_first(problem, seeds).tip_error.max() < 0.002)  # [m]
-    True
-    """
+    """Return a checked grasp on fixed contacts for each row with seeds, best first; six seeds of a row are tried."""
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_seeds(problem, seeds), (2, 4), partial(refine_on_contacts, problem))

@@ -28,8 +28,7 @@ PAPER_TOLERANCE = 10 * MILLIMETRE
 """Largest distance [m] of a tip from its contact in the paper's chain, about the radius of a tip."""
 TIP_TOLERANCE, TIP_PENETRATION = 1 * MILLIMETRE, 2 * MILLIMETRE
 """Largest distance [m] of a tip from its contact, and largest depth of a tip in the estimated surface."""
-ANGLE_TOLERANCE = math.radians(2)
-"""Largest angle [rad] of a contact direction outside the pad's cone."""
+ANGLE_TOLERANCE = math.radians(2)  # largest angle [rad] of a contact direction outside the pad's cone
 
 
 @checked
@@ -92,14 +91,7 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is the status of the contacts.
-
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> grasp = load_shipped_grasp("jug", "barrett")
-    >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
-    >>> len(GraspCandidates(placed, grasp.contacts, grasp.certificate, grasp.permutation, grasp.status))
-    1
-    """
+    """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is that of the contacts."""
 
     configuration: Annotated[Configuration, Rows("g")]
     contacts: Annotated[Contacts, Rows("g")]
@@ -111,16 +103,7 @@ class GraspCandidates(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
-    """Errors of grasps; `Grasps` explains the fields.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> grasp = load_shipped_grasp("jug", "barrett")
-    >>> placed = Configuration(grasp.joints, grasp.obj_from_hand)
-    >>> found = measure_errors(load_hand("barrett"), placed, grasp.contacts, CollisionWorld(table=0.0))
-    >>> Status(int(found.status)).name, found.tip_error < 0.001, found.clearance > 0
-    ('OK', tensor([[True, True, True]]), tensor([True]))
-    """
+    """Errors of grasps; `Grasps` explains the fields."""
 
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
     normal_angle: Annotated[Float[Tensor, "g f"], ANY]
@@ -178,18 +161,7 @@ def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) ->
 def check_candidates(
     problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
 ) -> Grasps:
-    """Return checked grasps (`measure_errors`); grasps without an error get a pre-grasp and an approach.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    >>> middle = grasp.contacts.points[0].mean(0)
-    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle)
-    >>> placed, order = Configuration(grasp.joints, grasp.obj_from_hand), torch.tensor([[0, 1, 2]])
-    >>> tried = GraspCandidates(placed, grasp.contacts, grasp.certificate, order, grasp.status)
-    >>> check_candidates(problem, tried).status
-    tensor([0])
-    """
+    """Return checked grasps (`measure_errors`); grasps without an error get a pre-grasp and an approach."""
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed

@@ -28,10 +28,8 @@ from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 
-ANGLE = 0.01
-"""Unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances."""
-FAR = 20.0
-"""Clearance [mm] above which clearances are not distinguished."""
+ANGLE = 0.01  # unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances
+FAR = 20.0  # clearance [mm] above which clearances are not distinguished
 
 
 def refine_by_cobyla(

@@ -24,16 +24,7 @@ from torchgrasp.hand.kinematics import map_points
 @checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
-    """Joints [rad] and pose of a free hand.
-
-    >>> from torchgrasp import load_hand
-    >>> hand = load_hand("barrett")
-    >>> start = Configuration(hand.lower[None], torch.eye(4).double()[None])
-    >>> step = torch.zeros(1, 10).double()
-    >>> step[:, 2] = 0.01  # 10 mm along the palm's axis
-    >>> start.integrate(hand, step).obj_from_hand[0, :3, 3]
-    tensor([0.0000, 0.0000, 0.0100], dtype=torch.float64)
-    """
+    """Joints [rad] and pose of a free hand."""
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Poses

@@ -15,10 +15,8 @@ from torchgrasp.ik.clearance import CollisionWorld, Obstacles, along
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.values import Grasps
 
-APPROACH_DISTANCE = 0.1
-"""Length [m] of the straight approach: about the depth of a hand."""
-COARSE_STEPS, FINE_STEPS = 8, 16
-"""Positions on each candidate path, and on a chosen path."""
+APPROACH_DISTANCE = 0.1  # length [m] of the straight approach: about the depth of a hand
+COARSE_STEPS, FINE_STEPS = 8, 16  # positions on each candidate path, and on a chosen path
 
 
 def find_approach(
@@ -102,13 +100,6 @@ def collision_probability(
 
     The unseen extent of one object decides whether its hidden voxels are full, so they are full or free together.
     Therefore the largest probability among the swept voxels counts. `up` is the direction of the lift; None: z.
-
-    >>> from torchgrasp import load_hand, load_scene
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> from torchgrasp.scene import estimate_occupancy
-    >>> obstacles = Obstacles.of(estimate_occupancy(load_scene(), 1))
-    >>> collision_probability(load_hand("barrett"), load_shipped_grasp("jug", "barrett"), obstacles)
-    tensor([0.9000], dtype=torch.float64)
     """
     up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
     configuration = Configuration(grasps.joints, grasps.obj_from_hand)
@@ -124,15 +115,7 @@ def collision_probability(
 
 @checked
 def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles, up: Float[Tensor, "3"] | None = None) -> float:
-    """Return the least clearance [m] of a lifted surface from obstacles: far below zero if another object lies on it.
-
-    >>> from torchgrasp import load_scene
-    >>> from torchgrasp.scene import estimate_occupancy
-    >>> scene = load_scene()
-    >>> obstacles = Obstacles.of(estimate_occupancy(scene, 1))
-    >>> lift_clearance(scene.cloud(1).points, obstacles) > 0  # nothing lies on it
-    True
-    """
+    """Return the clearance [m] of a lifted surface from obstacles: far below zero if an object lies on it."""
     up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
     return float(obstacles.field.query(_lifted(vertices, up))[0].min()) if len(vertices) else math.inf
 

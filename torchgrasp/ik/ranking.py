@@ -30,18 +30,13 @@ FEATURES = (
     "log of the stiffest finger's lever over 70 mm, at most",
 )
 """The features of the model of success, in this order."""
-LEAST_ARM = 0.1
-"""Added to the load's arm over the triangle's height, so that its logarithm is finite."""
+LEAST_ARM = 0.1  # added to the load's arm over the triangle's height, so that its logarithm is finite
 MODEL = Path(__file__).with_name("success.json")
 """Weights and bias of the model, and a description of its training data."""
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the order of rows by the first key, ties by the next.
-
-    >>> lexical_order(torch.tensor([1, 0, 1]), torch.tensor([2.0, 3.0, 1.0]))
-    tensor([1, 2, 0])
-    """
+    """Return the order of rows by the first key, ties by the next."""
     order = torch.argsort(keys[-1], stable=True)
     for key in reversed(keys[:-1]):
         order = order[torch.argsort(key[order], stable=True)]
@@ -49,11 +44,7 @@ def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the rank of each row within its group, by `lexical_order` of the keys.
-
-    >>> rank_in_group(torch.tensor([0, 1, 1, 1]), torch.tensor([1.0, 3.0, 2.0, 0.0]))
-    tensor([0, 2, 1, 0])
-    """
+    """Return the rank of each row within its group, by `lexical_order` of the keys."""
     order = lexical_order(group, *keys)
     grouped = group[order].contiguous()
     rank = torch.empty_like(order)
@@ -80,10 +71,6 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
 
     The object turns most easily about this side: only the third contact resists, by a lever of the height, and torsion,
     by a lever of 10 mm. More than three contacts count as their best three.
-
-    >>> triangle = torch.tensor([[[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.02, 0.0]]])
-    >>> load_arm(triangle, torch.tensor([0.0, 0.0, 0.06]))
-    tensor([2.])
     """
     if points.shape[1] > 3:
         triples = torch.tensor(list(itertools.combinations(range(points.shape[1]), 3)), device=points.device)
@@ -102,12 +89,6 @@ def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
 
     Joints of stiffness k yield by lever^2 / k under a unit force along the normal. If the surface is off by e, the
     force of the finger is off by k e / lever^2. A finger that points along its normal has no lever.
-
-    >>> from torchgrasp import load_hand, load_object, plan_grasps
-    >>> hand = load_hand("barrett")
-    >>> levers = finger_levers(hand, plan_grasps(load_object("cylinder").view, hand, starts=20))
-    >>> bool((levers < 0.15).all())
-    True
     """
     joints = grasps.joints
     hand_from_obj, coupling = inverse(grasps.obj_from_hand.to(joints)), hand.actuated.coupling.to(joints)
@@ -148,10 +129,6 @@ def success_log_odds(features: Float[Tensor, "g k"], hand: str) -> Float[Tensor,
     """Return the log-odds log(p / (1 - p)) of success of grasps with the hand of this name.
 
     A hand without trials in the training data gets the least bias of the other hands.
-
-    >>> good, bad = torch.tensor([[6.9, 0.3, -1.5, 0.0], [-1.0, 0.8, 0.3, -1.0]])
-    >>> success_log_odds(torch.stack([good, bad]), "allegro").diff() < 0
-    tensor([True])
     """
     model = json.loads(MODEL.read_text("utf-8"))
     bias = model["bias"].get(hand, min(model["bias"].values()))

@@ -16,10 +16,8 @@ from torchgrasp.values import Contacts
 
 TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0
 """Weights of a millimetre at a tip, and of a cosine outside the pad's cone; a millimetre of clearance weighs 1."""
-HAND_STEP = 0.6
-"""Largest step of a pose or a joint [m or rad]."""
-ITERATIONS = 30
-"""Most steps of one refinement."""
+HAND_STEP = 0.6  # largest step of a pose or a joint [m or rad]
+ITERATIONS = 30  # most steps of one refinement
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:

@@ -24,14 +24,11 @@ from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values import Contacts, IKSeeds
 
-LENGTH_SCALE, COSINE_SCALE = 0.01, 0.5
-"""Distances of tip centres [m] and of pad axes that count the same."""
+LENGTH_SCALE, COSINE_SCALE = 0.01, 0.5  # distances of tip centres [m] and of pad axes that count the same
 CANDIDATES = 64
 """Nearest postures of a row, over all assignments, whose clearances are measured; also the most seeds of a row."""
-ASSIGNMENTS = 6
-"""Assignments of contacts to fingers in which a row is compared with the whole library."""
-WRONG_SIDE = 0.3
-"""Mean cosine of the outward normals of tips and contacts above which a seed touches from inside."""
+ASSIGNMENTS = 6  # assignments of contacts to fingers in which a row is compared with the whole library
+WRONG_SIDE = 0.3  # mean cosine of the outward normals of tips and contacts above which a seed touches from inside
 
 
 @checked
@@ -219,11 +216,6 @@ def query_mixture(
 
     Raises:
         BadArgument: a mixture of another hand, limits or fingertips, a number out of range, or malformed contacts.
-
-    >>> from torchgrasp.hand.load import load_hand
-    >>> from torchgrasp.posture_model.mixture import load_mixture
-    >>> points = 0.05 * torch.eye(3)[None]
-    >>> seeds = query_mixture(load_hand("allegro"), Contacts(points, 20 * points), load_mixture("allegro"))
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)

@@ -30,8 +30,7 @@ from torchgrasp.values import Contacts, IKSeeds
 
 Method = Literal["levenberg_marquardt", "cobyla"]
 
-EXACT = 1e-6
-"""Sum of squared residuals [mm2] at which a seed is done."""
+EXACT = 1e-6  # sum of squared residuals [mm2] at which a seed is done
 
 
 @checked

@@ -24,16 +24,11 @@ from torchgrasp.geometry.frames import degenerate, subsets
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.wrench import BALANCED, Vectors, centre_and_radius, wrenches
 
-PIVOTS = 100
-"""Most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the optimum."""
-OPTIMAL = 1e-12
-"""Multipliers below this are zero: the objective grows no further."""
-ARTIFICIAL_GAIN = 1e3
-"""Added to the gain of the artificial rows, far above any multiplier: they leave first."""
-BLOCKING = 1e-11
-"""A bound approached more slowly than this, for each unit of the step, is parallel to it."""
-GRASPS_PER_CHUNK = 2048
-"""Grasps at a time: their tableaux stay in the cache."""
+PIVOTS = 100  # most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the optimum
+OPTIMAL = 1e-12  # multipliers below this are zero: the objective grows no further
+ARTIFICIAL_GAIN = 1e3  # added to the gain of the artificial rows, far above any multiplier: they leave first
+BLOCKING = 1e-11  # a bound approached more slowly than this, for each unit of the step, is parallel to it
+GRASPS_PER_CHUNK = 2048  # grasps at a time: their tableaux stay in the cache
 
 
 def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
@@ -108,8 +103,7 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
 
 PARALLEL = 1e-9
 """Planar wrenches (of length about 1) with a shorter cross product are parallel: above rounding in float64."""
-FIRST_EDGES = 4
-"""Edges of a cone in the first programme."""
+FIRST_EDGES = 4  # edges of a cone in the first programme
 ROUNDS = 12
 """Most programmes: twenty random grasps of four contacts close at friction 2e-7 too great at most, relatively; after
 eight programmes it is 4e-5."""

@@ -26,8 +26,7 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Contacts
 
-FOOTPRINT = 0.012
-"""Half the width [m] over which a fingertip senses the slope of the surface: the radius of its sphere."""
+FOOTPRINT = 0.012  # half the width [m] over which a fingertip senses the slope of the surface: the radius of its sphere
 NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
 """Nodes of a line, in standard deviations of the surface at its contact: three err by 0.07, five by 0.02 at most."""
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
@@ -65,11 +64,7 @@ def grid() -> Float[Tensor, "23"]:
 
 @functools.cache
 def grid_weights() -> Float[Tensor, "23 5"]:
-    """Return the weights of the nodes in the deviations on the grid.
-
-    >>> grid_weights()[[0, 3, 7, 9]].tolist()
-    [[1.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.5, 0.0, 0.0]]
-    """
+    """Return the weights of the nodes in the deviations on the grid."""
     return interpolation(grid(), torch.tensor(NODES, dtype=torch.float64))
 
 
@@ -180,10 +175,8 @@ def first_contact(
     return lines.points[:, None] + motion * lines.normals[:, None], unit((weights @ slope)[..., 0, :])
 
 
-DRAWS_PER_CHUNK = 8192
-"""Drawn rows that are judged at a time: their tensors take about 20 MB."""
-GPU_DRAWS = 2**18
-"""The same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)."""
+DRAWS_PER_CHUNK = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
+GPU_DRAWS = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
 
 
 @checked

@@ -28,10 +28,8 @@ from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
 
-JUDGED_POINTS, GUIDING_POINTS = 8, 4
-"""Points of the ring on which a plan is judged, and fewer that guide a solver."""
-INSIDE = 0.95
-"""Share of the largest variation that guiding points allow: the judged points lie between them."""
+JUDGED_POINTS, GUIDING_POINTS = 8, 4  # points of the ring on which a plan is judged, and fewer that guide a solver
+INSIDE = 0.95  # share of the largest variation that guiding points allow: the judged points lie between them
 
 
 def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:

@@ -31,24 +31,16 @@ from torchgrasp.plan.wrench import Vectors, centre_and_radius, wrenches
 
 DIRECTIONS, NEIGHBOURS, REFINEMENTS, SHRINK = 1024, 128, 12, 0.55
 """The search tries all directions, then neighbours of the best in rounds, each of a smaller radius by `SHRINK`."""
-EVENNESS = 0.01
-"""Weight of the ratio of the largest to the least normal force, against the tangent needed."""
-PREFERENCE = 0.2
-"""Weight of the distance from the preferred proportions, against the tangent needed."""
-SLACK = 0.04
-"""Tangent that four or five contacts may need beyond the least one, so that their forces are more even."""
+EVENNESS = 0.01  # weight of the ratio of the largest to the least normal force, against the tangent needed
+PREFERENCE = 0.2  # weight of the distance from the preferred proportions, against the tangent needed
+SLACK = 0.04  # tangent that four or five contacts may need beyond the least one, so that their forces are more even
 STEPS, KEPT = 30, 0.3
 """Newton steps, and the share of tau's distance from the needed ratio that remains after each step."""
-MAX_FRICTION = 10.0
-"""Tangent of the widest friction cones in which forces are sought."""
+MAX_FRICTION = 10.0  # tangent of the widest friction cones in which forces are sought
 
 
 def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
-    """Return the map from the n = 3 f numbers of the forces at `points` to force and torque about their centre.
-
-    >>> grasp_map(torch.eye(3)).shape
-    torch.Size([6, 9])
-    """
+    """Return the map from the n = 3 f numbers of the forces at `points` to force and torque about their centre."""
     arms = points - points.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
     return torch.cat([torch.cat([eye] * arms.shape[-2], -1), torch.cat(skew(arms).unbind(-3), -1)], -2)
@@ -59,9 +51,6 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
 
     The forces and torques of each push cancel. The pushes span the null space of the grasp map, except for four or
     five contacts in one plane. The order of pairs is that of `contact_pairs`.
-
-    >>> internal_forces(torch.eye(3)).sum(1).abs().max()
-    tensor(0.)
     """
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)

@@ -24,8 +24,7 @@ from torchgrasp.plan.wrench import Vectors
 from torchgrasp.shape.values import MeanJet, SurfaceJet
 from torchgrasp.specs import ContactSpec
 
-INSIDE = 0.99
-"""Inequalities are solved to this share of their bound: the last steps onto the surface stay inside it."""
+INSIDE = 0.99  # inequalities are solved to this share of their bound: the last steps onto the surface stay inside it
 CONE_MARGIN = 0.02
 """The cosine between force and inward normal exceeds that of the cone by this much: strictly inside, as phi > 0."""
 LEAST_SIDE = 0.05
@@ -86,11 +85,7 @@ def with_variance(jet: MeanJet, variance: Float[Tensor, "b f"], gradient: Float[
 
 @functools.cache
 def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
-    """Return all pairs of contacts: each with the next, then each with the one after it.
-
-    >>> contact_pairs(3, torch.device("cpu")).tolist()
-    [[0, 1, 2], [1, 2, 0]]
-    """
+    """Return all pairs of contacts: each with the next, then each with the one after it."""
     order = [(i, (i + gap) % fingertips) for gap in range(1, fingertips // 2 + 1) for i in range(fingertips)]
     return torch.tensor(order[: fingertips * (fingertips - 1) // 2], device=device).T
 

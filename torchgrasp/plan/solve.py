@@ -28,8 +28,7 @@ SEARCH = (Stage(centre=3.0, cones=0.3, steps=10), Stage(centre=1.0, cones=3.0, s
 The last two give way where the centre cannot be reached."""
 TO_CENTRE = (Stage(centre=0.3, cones=3.0, steps=8, exact=False),)
 """The stage from rows of candidates, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
-LEAST_STARTS = 25
-"""Fewest starts at a time under a time budget: with less, the overhead of each step outweighs them."""
+LEAST_STARTS = 25  # fewest starts at a time under a time budget: with less, the overhead of each step outweighs them
 Chunk = tuple[Float[Tensor, "_ f 3"], tuple[Stage, ...]]
 """Normalised starts on the surface, and the stages from there."""
 

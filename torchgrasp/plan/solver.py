@@ -29,12 +29,9 @@ from torchgrasp.shape.surface import newton_step
 
 LONGEST_STEP = 0.3
 """A point moves at most this far in a step (normalised): about the range in which the surface is smooth."""
-TENSION_DAMPING = 0.1
-"""Damping of the tensions relative to that of the points: tensions may change faster."""
-SURFACE = 10.0
-"""Weight of the surface: a step off it would be undone by the projection, which the cones then resist."""
-BOUNDS = 3.0
-"""Weight of all bounds but the cones, as great as that of the cones in the last stage."""
+TENSION_DAMPING = 0.1  # damping of the tensions relative to that of the points: tensions may change faster
+SURFACE = 10.0  # weight of the surface: a step off it would be undone by the projection, which the cones then resist
+BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cones in the last stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,8 +49,7 @@ class Stage:
     exact: bool = True
 
 
-FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)
-"""The last stage, feasibility alone."""
+FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)  # the last stage, feasibility alone
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,15 +24,13 @@ CANDIDATE_FLATNESS = 0.9
 """Share of the largest normal variation that a candidate may have: its ring turns with the triple it joins."""
 FAR = 0.1
 """A start with a point farther than this from the surface (normalised signed distance) is no guess of contacts."""
-NEAR_CENTRE = 0.1
-"""Normalised distance from the centre to which such a start is drawn in: the paper's radius of starts."""
+NEAR_CENTRE = 0.1  # normalised distance from the centre to which such a start is drawn in: the paper's radius of starts
 DRAWN_PER_START, ROUNDS = 20, 8
 """Rows drawn for each start in one round, and most rounds: 2 to 10 % of the candidates' triples are closed."""
 ENOUGH_CLOSED, SURVEYED = 0.1, 250
 """Share of starts, and of how many, that are closed from the draw on where contacts can be as flat as is asked: the
 hand then gets a hundred triples of a thousand starts."""
-STARTS_PER_CHUNK = 500
-"""Starts planned at once: memory is bounded, and a plan from fewer starts begins one from more."""
+STARTS_PER_CHUNK = 500  # starts planned at once: memory is bounded, and a plan from fewer starts begins one from more
 
 
 def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int) -> None:

@@ -15,8 +15,7 @@ from torchgrasp.geometry.linalg import unit
 
 Vectors = Float[Tensor, "b f 3"]
 """A vector at each of the contacts in every row: points or normals."""
-BALANCED = 1e-9
-"""Largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about 1)."""
+BALANCED = 1e-9  # largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about 1)
 MIN_MARGIN = 1e-6
 """Least positive coefficient: far above the certificate's errors, far below equal coefficients, 1 / (f e)."""
 MIN_RANK_RATIO = 1e-3
@@ -72,11 +71,7 @@ def cone_edges(
 
 
 def wrenches(points: Vectors, normals: Vectors, friction: float, edges: int = 8) -> Float[Tensor, "b f e 6"]:
-    """Return the primitive contact wrenches w of Eq. (13): force, then torque.
-
-    >>> wrenches(torch.eye(3)[None], torch.eye(3)[None], friction=0.5).shape
-    torch.Size([1, 3, 8, 6])
-    """
+    """Return the primitive contact wrenches w of Eq. (13): force, then torque."""
     force = cone_edges(normals, tangents(points, normals), friction, edges)
     centre, radius = centre_and_radius(points)
     arm = ((points - centre) / radius)[:, :, None].expand_as(force)

@@ -35,8 +35,7 @@ FIRST_STEPS = 8
 """Most steps of the solver in the first batch; the second batch tries unsolved rows again with all steps."""
 TRIED, TRIED_IN_SCENE = 250, 160
 """Most rows of contacts that the hand tries. In a scene more postures of each row are tried."""
-OFFERED = 4
-"""Planned rows for each row that the hand tries."""
+OFFERED = 4  # planned rows for each row that the hand tries
 
 
 class Batch(NamedTuple):
@@ -47,11 +46,7 @@ class Batch(NamedTuple):
 
 
 def schedule(starts: int, most: int) -> list[Batch]:
-    """Return the batches in which `starts` are planned and `most` rows tried; a small rest joins the last batch.
-
-    >>> [tuple(batch) for batch in schedule(1000, 250)]
-    [(32, 8), (192, 48), (776, 194)]
-    """
+    """Return the batches in which `starts` are planned and `most` rows tried; a small rest joins the last batch."""
     batches, size, most = list[Batch](), FIRST, min(most, starts)
     tried = planned = 0
     while tried < most:
@@ -236,10 +231,6 @@ class Report:
 
 
 def describe(counts: dict[Status, int]) -> str:
-    """Return counts of statuses as one line, the successes first.
-
-    >>> describe({Status.NOT_CLOSED: 2, Status.OK: 1})
-    '1 ok, 2 not_closed'
-    """
+    """Return counts of statuses as one line, the successes first."""
     ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
     return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"

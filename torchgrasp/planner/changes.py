@@ -9,8 +9,7 @@ from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.planner.problem import Request, finger_sets, take_target
 from torchgrasp.scene.scene import Scene
 
-FRICTIONS = (0.4, 0.8, 1.2)
-"""Coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone."""
+FRICTIONS = (0.4, 0.8, 1.2)  # coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone
 
 UNKNOWN = frozenset({Status.OUT_OF_DOMAIN, Status.TOO_UNCERTAIN})
 AT_TABLE = frozenset({Status.BELOW_TABLE, Status.TABLE_COLLISION, Status.PREGRASP, Status.NO_APPROACH})

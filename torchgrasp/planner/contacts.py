@@ -73,14 +73,7 @@ def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable
 
 @checked
 def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
-    """Return at most `most` successful rows, far apart, in plan order.
-
-    >>> from torchgrasp import fit_shape, load_object, plan_contacts
-    >>> plan = plan_contacts(fit_shape(load_object("jug").view), starts=20)
-    >>> rows = spread_rows(plan, 3)
-    >>> len(rows), bool((plan.status[rows] == Status.OK).all())
-    (3, True)
-    """
+    """Return at most `most` successful rows, far apart, in plan order."""
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
         return rows

@@ -22,20 +22,13 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds, PointCloud
 
-TRIAL_STARTS = 100
-"""Starts with which a change is tried."""
-MOST_TRIALS = 8
-"""Most changes that are tried."""
+TRIAL_STARTS = 100  # starts with which a change is tried
+MOST_TRIALS = 8  # most changes that are tried
 
 
 @dataclasses.dataclass(frozen=True)
 class Losses(Value):
-    """How many `things` a stage was given, and how many it lost for each reason, the most frequent first.
-
-    >>> lost = Losses("contacts", "starts", 50, {Status.NOT_CLOSED: 10})
-    >>> lost.kept, str(lost)
-    (40, 'contacts: 40 of 50 starts (10 not_closed)')
-    """
+    """How many `things` a stage was given, and how many it lost for each reason, the most frequent first."""
 
     stage: str
     things: str
@@ -114,9 +107,6 @@ class Trial(Value):
     """The result of one change: the number of executable grasps, and the `expected_success` of the best grasps.
 
     A `choice` is up to the user; any other change is a fact of the world.
-
-    >>> print(Trial("with friction 0.8", choice=False, executable=2, expected=1.7, funnel=Funnel(())))
-    with friction 0.8: 2 executable grasps
     """
 
     words: str

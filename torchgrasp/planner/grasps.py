@@ -25,8 +25,7 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud, load_grasps
 
-BEST = 20
-"""Best grasps of a set of fingers by which the set is judged: the number that an evaluation tries of a view."""
+BEST = 20  # best grasps of a set of fingers by which the set is judged: the number that an evaluation tries of a view
 
 
 @overload

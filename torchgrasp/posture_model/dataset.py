@@ -25,14 +25,10 @@ from torchgrasp.posture_model.sample import (
     draw_chunk,
 )
 
-MANIFEST = "samples.json"
-"""File that describes the samples of a folder."""
-MAX_MANIFEST = 1024 * 1024
-"""Most bytes of a manifest: the file of a stranger must not fill the memory."""
-KEPT = 128
-"""Chunks that stay in memory: all of a million postures, which take 200 MB."""
-META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
-"""The keys of `SampleSpec.meta`."""
+MANIFEST = "samples.json"  # file that describes the samples of a folder
+MAX_MANIFEST = 1024 * 1024  # most bytes of a manifest: the file of a stranger must not fill the memory
+KEPT = 128  # chunks that stay in memory: all of a million postures, which take 200 MB
+META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")  # the keys of `SampleSpec.meta`
 
 
 Chunk = Annotated[int, Range(0, 1_000_000)]

@@ -49,14 +49,11 @@ class Shard:
         return int(self.sum(self.rows.new_tensor(len(self.rows), dtype=torch.int64)))
 
 
-CACHED_ROWS = 2048
-"""Rows of one pass: their features and responsibilities stay in the cache."""
+CACHED_ROWS = 2048  # rows of one pass: their features and responsibilities stay in the cache
 GPU_ROWS = 2**17
 """Rows of one pass on a GPU, which smaller passes leave idle; features take 200 MB (`scripts/bench.py gpu`)."""
-SINGULAR_VARIANCE = 1e-12
-"""A conditional variance of this size is rounding, beside the data's variance of 1."""
-MAX_RESEEDS = 3
-"""A component that collapses more often shows that the data support fewer components."""
+SINGULAR_VARIANCE = 1e-12  # a conditional variance of this size is rounding, beside the data's variance of 1
+MAX_RESEEDS = 3  # a component that collapses more often shows that the data support fewer components
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,8 +14,7 @@ from torchgrasp.values import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
 """The six assignments of three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
-CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")
-"""The numbers of a code q = (L, N): three lengths [m], three cosines."""
+CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")  # the numbers of a code q = (L, N): three lengths [m], three cosines
 
 
 def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b q"]:
@@ -25,9 +24,6 @@ def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*
     motion does not change the code. Negated normals do not change it either, so fingertips have the code of the
     contacts that they touch. Nor do a mirror image or a rotation of the normals alone: every match has to be checked
     afterwards.
-
-    >>> encode_fingertips(torch.eye(3), torch.eye(3))[3:]
-    tensor([0., 0., 0.])
     """
     lengths = torch.linalg.vector_norm(points - points.mean(-2, keepdim=True), dim=-1)
     cosines = torch.stack([(n * m).sum(-1) for n, m in itertools.combinations(normals.unbind(-2), 2)], dim=-1)

@@ -20,8 +20,7 @@ from torchgrasp.posture_model.sample import HandSamples
 
 MAX_REGULARISATION = 1e-6
 """Largest variance added to a dimension, relative to the data's: scikit-learn's default, which is absolute there."""
-TRIAL_STEPS = 20
-"""Steps of EM before starts are compared; a whole fit takes some hundred."""
+TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes some hundred
 
 
 @checked

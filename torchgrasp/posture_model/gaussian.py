@@ -15,8 +15,7 @@ from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import cholesky
 
-ROWS_PER_CHUNK = 8192
-"""Rows evaluated together: this bounds the memory for rows x components x dimensions."""
+ROWS_PER_CHUNK = 8192  # rows evaluated together: this bounds the memory for rows x components x dimensions
 
 
 @checked

@@ -9,10 +9,8 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model.em import CACHED_ROWS, Progress, Shard, features_from_data, maximisation
 
-SUBSAMPLE = 20_000
-"""Rows among which k-means++ chooses its centres: some hundred for each component."""
-LLOYD_ROUNDS = 10
-"""Rounds of Lloyd's algorithm: EM follows, so the clusters need not converge."""
+SUBSAMPLE = 20_000  # rows among which k-means++ chooses its centres: some hundred for each component
+LLOYD_ROUNDS = 10  # rounds of Lloyd's algorithm: EM follows, so the clusters need not converge
 
 
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:

@@ -25,8 +25,7 @@ from torchgrasp.specs import ContactSpec
 
 ROLL = math.radians(25)
 """Deviation [rad] of either tilt of a contact direction: of 1904 planned grasps half are tilted by more than 30."""
-BALANCES = 200
-"""Directions in the three-dimensional space of internal forces that are tried: 0.25 rad apart."""
+BALANCES = 200  # directions in the three-dimensional space of internal forces that are tried: 0.25 rad apart
 
 
 def roll_contacts(
@@ -78,12 +77,9 @@ def _close_triples(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3
 
 CHUNK_POSTURES = 10_000
 """Free postures from one generator. It is no argument, because another number gives a seed other postures."""
-BLOCK_POSTURES = 2_000
-"""Postures that a generator draws at a time; fixed for the same reason."""
-MAX_SAMPLES = 10**8
-"""Most postures of one set: a hundred times the paper's million (Sec. 6.3)."""
-LEAST_KEPT = 1e-3
-"""Least share of postures that are kept, after ten blocks: another hand would draw for hours."""
+BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for the same reason
+MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
+LEAST_KEPT = 1e-3  # least share of postures that are kept, after ten blocks: another hand would draw for hours
 
 Sampling = Literal["uniform", "grasping"]
 """Which free postures are taken.

@@ -22,8 +22,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import GRID
 from torchgrasp.limits import CLOUD_BYTES
 
-LEAST_PIXELS = 30
-"""Fewest pixels of an object: fewer do not show its shape."""
+LEAST_PIXELS = 30  # fewest pixels of an object: fewer do not show its shape
 
 
 @checked
@@ -32,11 +31,6 @@ class DepthImage(Value):
     """A pinhole camera's depth image: `depth` [m] along the optical axis, 0 where nothing was measured.
 
     `intrinsics` [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] are pixels. `obj_from_camera` is the camera's pose.
-
-    >>> camera = torch.tensor([[100.0, 0, 1.5], [0, 100, 1.5], [0, 0, 1]])
-    >>> image = DepthImage(torch.full((4, 4), 0.5), camera, torch.eye(4))
-    >>> image.points()[0, 0]  # [m]
-    tensor([-0.0075, -0.0075,  0.5000], dtype=torch.float64)
     """
 
     depth: Float[Tensor, "h w"]

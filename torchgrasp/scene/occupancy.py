@@ -23,14 +23,10 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.scene import Scene
 
-SPACING = 0.005
-"""Spacing [m] of the voxels: a third of a finger's width."""
-SIDEWAYS, ABOVE = 0.25, 0.04
-"""How far [m] voxels extend around the target's points, and above everything."""
-NOISE = 0.004
-"""Space this far [m] in front of a measured depth is free: three standard deviations of the noise."""
-LOW = 0.01
-"""Height [m] above the table below which unlabelled pixels show the table."""
+SPACING = 0.005  # spacing [m] of the voxels: a third of a finger's width
+SIDEWAYS, ABOVE = 0.25, 0.04  # how far [m] voxels extend around the target's points, and above everything
+NOISE = 0.004  # space this far [m] in front of a measured depth is free: three standard deviations of the noise
+LOW = 0.01  # height [m] above the table below which unlabelled pixels show the table
 MODEL = Path(__file__).with_name("occupancy.json")
 """Knots and weights of the model of occupancy, and what they were fitted on."""
 

@@ -15,18 +15,13 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
 
-BAND = 0.010
-"""Heights [m] below this, of either sign, measure the noise of the table."""
-LEAST_HEIGHT = 0.002
-"""Least height [m] of an object's pixels above the table."""
-NEAR = 0.005
-"""Distance [m] within which a pixel at a depth jump belongs to an object."""
-FEW = 6
-"""Pieces with fewer pixels are noise."""
+BAND = 0.010  # heights [m] below this, of either sign, measure the noise of the table
+LEAST_HEIGHT = 0.002  # least height [m] of an object's pixels above the table
+NEAR = 0.005  # distance [m] within which a pixel at a depth jump belongs to an object
+FEW = 6  # pieces with fewer pixels are noise
 GAP, TOUCH, FLOATING_GAP = 0.008, 3, 0.013
 """Pieces touch where TOUCH pixels are within GAP [m]; a floating piece belongs to one within FLOATING_GAP [m]."""
-MASK_SHARE = 0.05
-"""Least share of a mask's pixels on the target: a third of a box drawn around an object are."""
+MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a box drawn around an object are
 
 
 def segment(image: DepthImage, table: Plane) -> Int[Tensor, "h w"]:
@@ -38,12 +33,6 @@ def segment(image: DepthImage, table: Plane) -> Int[Tensor, "h w"]:
     Args:
         image: one view of the scene.
         table: the plane that the objects stand on, in the frame of the image.
-
-    >>> k = torch.tensor([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]).double()
-    >>> depth = torch.full((48, 64), 0.5).double()
-    >>> depth[10:20, 10:30] = 0.45
-    >>> segment(DepthImage(depth, k, torch.eye(4).double()), Plane(torch.tensor([0, 0, -1.0]), -0.5)).unique()
-    tensor([0, 1])
     """
     measured, smooth = image.depth > 0, image.without_speckle()
     mean, threshold = _smoothed(image, table)

@@ -14,22 +14,16 @@ from torchgrasp.geometry.plane import Plane, as_plane
 
 NOISE, NOISE_GROWTH = 0.001, 0.0035
 """Assumed noise [m] of a depth camera, and its growth with the squared distance [1/m]."""
-LEAST_SHARE = 0.05
-"""Least share of the points on the plane."""
-MOST_BELOW = 0.06
-"""Greatest number of points below, over the number on the plane: flying pixels at rims are fewer."""
-LEAST_STANDING = 0.001
-"""Least share of the points that stand on the plane, over its own part of the picture."""
-LEAST_WIDTH = 0.04
-"""Least spread [m] of the points on the plane along its narrower side, as a standard deviation."""
+LEAST_SHARE = 0.05  # least share of the points on the plane
+MOST_BELOW = 0.06  # greatest number of points below, over the number on the plane: flying pixels at rims are fewer
+LEAST_STANDING = 0.001  # least share of the points that stand on the plane, over its own part of the picture
+LEAST_WIDTH = 0.04  # least spread [m] of the points on the plane along its narrower side, as a standard deviation
 REACH = 0.30
 """Height [m] of objects, above or below a plane: a floor is deeper below a table, and a wall extends farther."""
-MOST_TILT = 30.0
-"""Greatest angle [deg] between the normal and `up`."""
+MOST_TILT = 30.0  # greatest angle [deg] between the normal and `up`
 RIVAL = 0.15
 """A second plane with this share of the points of the first, at more than 15 degrees from it, makes both ambiguous."""
-SUPPORT = "one plane with objects on it and nothing below it, or a table that is given"
-"""What a scene must show."""
+SUPPORT = "one plane with objects on it and nothing below it, or a table that is given"  # what a scene must show
 
 
 def find_table(
@@ -70,12 +64,6 @@ def fit_support(
         BadArgument: a wrong shape or type, or points that are not finite.
         NoSupport: no plane holds enough points; objects are on both sides of each; the camera is below; two planes
             could be the table.
-
-    >>> x, y = torch.rand(2, 3000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    >>> on_box = (x > 0.4) & (x < 0.6) & (y > 0.4) & (y < 0.6)
-    >>> plane = fit_support(torch.stack([x, y, 0.05 * on_box], -1))
-    >>> round(float(plane.normal[2]), 6), abs(round(plane.offset, 6))
-    (1.0, 0.0)
     """
     points = check_tensor("points", points, (None, 3)).detach().cpu().double()
     eye = None if viewpoint is None else check_tensor("viewpoint", viewpoint, (3,)).detach().cpu().double()

@@ -42,8 +42,7 @@ from torchgrasp.shape.values import Normalisation, Observations, off_surface, on
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import PointCloud
 
-MAX_BUDGET = 1000
-"""Greatest number of observed points: their factor has 4000 rows."""
+MAX_BUDGET = 1000  # greatest number of observed points: their factor has 4000 rows
 
 
 @checked

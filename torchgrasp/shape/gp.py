@@ -26,8 +26,7 @@ from torchgrasp.shape.values import (
 )
 from torchgrasp.values import PointCloud, ShapeEstimate
 
-MAX_JOINT = 1000
-"""Most points of one joint posterior: its memory grows with the square of their number."""
+MAX_JOINT = 1000  # most points of one joint posterior: its memory grows with the square of their number
 
 
 @dataclasses.dataclass(frozen=True)

@@ -57,9 +57,6 @@ def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple
 
     dk/du is k'(r) / r, whose limit at r = 0 is k''(0). Higher derivatives are set to 0 at r = 0, where they may be
     infinite: covariances multiply them by a power of r.
-
-    >>> differentiate(lambda r: torch.exp(-(r**2)), torch.zeros(1), 2)
-    (tensor([1.]), tensor([-2.]))
     """
     k, *by_r = _differentiate_by_distance(profile, r, max(count - 1, 1))
     *_, midpoint = _differentiate_by_distance(profile, r / 2, 2)
@@ -89,9 +86,6 @@ def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
 
     The kernel and its slope vanish at r = psi. It is a covariance only within a ball of diameter 3/4 psi. The paper's
     psi, the longest distance of the data, is too small for this.
-
-    >>> thin_plate(torch.tensor([0.0, 2.0]), psi=2.0)
-    tensor([8., 0.])
     """
     # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals need it.
     return r * r * (2.0 * r - 3.0 * psi) + psi**3
@@ -151,10 +145,6 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
 
     Raises:
         BadArgument: another name.
-
-    >>> wide = kernel_by_name("rbf", psi=2.0).profile(torch.tensor([0.0, 1.0]))
-    >>> wide[0]  # psi^3
-    tensor(8.)
     """
     if name == "thin_plate":
         return thin_plate_kernel(psi)

@@ -16,18 +16,13 @@ from torchgrasp.shape.values import Normalisation, Observations, off_surface, on
 
 OUTER_POINTS, OUTER_RADIUS = 20, 1.2
 """Number of points outside, and the radius, normalised, of the sphere on which they lie (Sec. 3.1)."""
-OUTER_NOISE = 0.3
-"""Standard deviation, normalised, of a distance outside: the nearest of sparse points is too far away."""
+OUTER_NOISE = 0.3  # standard deviation, normalised, of a distance outside: the nearest of sparse points is too far away
 NORMAL_NOISE, RIM_NORMAL_NOISE, HIDDEN_NORMAL_NOISE = 0.05, 0.5, 0.25
 """Standard deviations of normals: of a seen one, of one on the outline, and of one on the hidden side."""
-RIM_NOISE = 0.002
-"""Standard deviation [m] of a point of the outline."""
-FREE_NOISE = 0.003
-"""Standard deviation [m] of a distance observed in free space: it is only a lower bound."""
-OUTLINE_ERROR = 0.005
-"""The object may reach this far [m] beyond its outline: a camera loses rims."""
-MAX_RADIUS = 1.15
-"""Radius, normalised, within which free space is probed: inside the sphere of the points outside."""
+RIM_NOISE = 0.002  # standard deviation [m] of a point of the outline
+FREE_NOISE = 0.003  # standard deviation [m] of a distance observed in free space: it is only a lower bound
+OUTLINE_ERROR = 0.005  # the object may reach this far [m] beyond its outline: a camera loses rims
+MAX_RADIUS = 1.15  # radius, normalised, within which free space is probed: inside the sphere of the points outside
 STD_FACTORS: dict[tuple[Kind, bool], float] = {
     ("ball", True): 0.5,
     ("revolution", True): 0.56,

@@ -23,13 +23,11 @@ from torchgrasp.threads import single_threaded
 if TYPE_CHECKING:
     import trimesh
 
-RESOLUTION = 48
-"""Cells along the domain's diameter."""
+RESOLUTION = 48  # cells along the domain's diameter
 COARSE, STEEPER = 4, 1.3
 """Cells along the side of the first blocks of the grid, and a bound on the slope of the mean within a block over
 the slope between its corners: blocks that the zero level cannot reach are not refined."""
-LEAST_SHARE = 0.02
-"""Least share of the cloud nearest to a sheet of the zero level that is kept."""
+LEAST_SHARE = 0.02  # least share of the cloud nearest to a sheet of the zero level that is kept
 
 
 @checked

@@ -139,11 +139,7 @@ class ShapeDerivatives(Value):
 
 
 def surface_deviation(variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the standard deviation of the surface along its normal, to first order in that of the distance.
-
-    >>> surface_deviation(torch.tensor([0.04]), torch.tensor([[0.0, 0.0, 2.0]]))
-    tensor([0.1000])
-    """
+    """Return the standard deviation of the surface along its normal, to first order in that of the distance."""
     return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)
 
 

@@ -22,8 +22,7 @@ from torchgrasp.sim.decompose import decompose
 if TYPE_CHECKING:
     import trimesh
 
-MAX_PARTS = 1000
-"""Most parts that a caller may give."""
+MAX_PARTS = 1000  # most parts that a caller may give
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """CoACD's search for cuts, narrower and faster than its default."""

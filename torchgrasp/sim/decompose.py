@@ -18,8 +18,7 @@ import numpy as np
 if TYPE_CHECKING:
     import trimesh
 
-SECONDS, SECONDS_PER_FACE = 60.0, 0.005
-"""Processor time [s] that a mesh may take, and further time [s] for each face."""
+SECONDS, SECONDS_PER_FACE = 60.0, 0.005  # processor time [s] that a mesh may take, and further time [s] for each face
 
 
 def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:

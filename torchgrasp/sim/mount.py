@@ -16,8 +16,7 @@ from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, 
 MOUNT_DRIVE = Actuator(effort=1e4, velocity=10.0, kp=1e4, kd=1e3)
 """Motor of a slide: force [N], speed [m/s], stiffness [N/m], damping [N s/m]."""
 
-WRIST_JOINT = "torchgrasp_wrist"
-"""Name of the fixed joint between mount and hand."""
+WRIST_JOINT = "torchgrasp_wrist"  # name of the fixed joint between mount and hand
 
 
 class Slide(NamedTuple):

@@ -14,8 +14,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
 from torchgrasp.specs import Simulator
 
-STILL = np.zeros(3)
-"""No force, no torque."""
+STILL = np.zeros(3)  # no force, no torque
 
 NEIGHBOURS, TABLETOP, TARGET = range(3)
 """Places in `StepContacts.stray`: contacts of the hand that are not a finger's with the object."""
@@ -33,12 +32,6 @@ class StepContacts:
         force: force of each fingertip on the object (f, 3) [N], friction included.
         stray: sums of normal impulses (3,) [N s] of the hand on neighbours, on the table, and of links other than
             the fingers' on the object.
-
-    >>> tick, step = StepContacts.none(), StepContacts.none()
-    >>> step.add(1, np.array([0.0, 0.0, 0.02]), 0.02, np.array([0.0, 0.0, 0.1]))
-    >>> tick.accumulate(step, count=5)
-    >>> tick.impulse[1]
-    array([0.  , 0.  , 0.02])
     """
 
     impulse: np.ndarray

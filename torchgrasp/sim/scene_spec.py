@@ -14,11 +14,9 @@ from torchgrasp.hand.hand import Actuator
 if TYPE_CHECKING:
     import trimesh
 
-ARMATURE = 1e-3
-"""Inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it."""
+ARMATURE = 1e-3  # inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it
 
-TABLE = (2.0, 2.0, 0.1)
-"""Size of the table [m]."""
+TABLE = (2.0, 2.0, 0.1)  # size of the table [m]
 
 LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
 """Prismatic joints of the mount: along the world's z axis, and along the approach, where 0 is the hand's pose."""
@@ -50,13 +48,7 @@ class Neighbour:
 @checked
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A rigid body of the simulator: its mesh, convex parts that make up the mesh, and its mass [kg].
-
-    >>> import trimesh
-    >>> box = trimesh.creation.box([0.1, 0.1, 0.1])
-    >>> Body(box, [box], mass=0.6).inertia.diagonal().round(6)  # m a^2 / 6
-    array([0.001, 0.001, 0.001])
-    """
+    """A rigid body of the simulator: its mesh, convex parts that make up the mesh, and its mass [kg]."""
 
     mesh: "trimesh.Trimesh"
     parts: "Sequence[trimesh.Trimesh]"

@@ -18,10 +18,8 @@ from torchgrasp.hand.kinematics import chain_from_urdf
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
 
-FK_POSTURES = 50
-"""Number of random postures in which kinematics are compared."""
-FK_TOLERANCE = 1e-8
-"""Largest difference [m, and entries of rotations] from the poses of other libraries."""
+FK_POSTURES = 50  # number of random postures in which kinematics are compared
+FK_TOLERANCE = 1e-8  # largest difference [m, and entries of rotations] from the poses of other libraries
 STEP, JACOBIAN_TOLERANCE = 1e-6, 1e-6
 """Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian."""
 

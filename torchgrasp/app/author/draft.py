@@ -25,8 +25,7 @@ from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.urdf import REPAIR, Mimic, Triple, Urdf, read_published
 
-OPTIONS = {"default": 3, "four": 4, "five": 5}
-"""Sets of fingers that a draft declares if the hand has as many."""
+OPTIONS = {"default": 3, "four": 4, "five": 5}  # sets of fingers that a draft declares if the hand has as many
 
 
 class Draft(NamedTuple):

@@ -22,16 +22,12 @@ from torchgrasp.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACE
 if TYPE_CHECKING:
     import trimesh
 
-MESH_KINDS = (".stl", ".obj", ".ply")
-"""Formats of meshes that contain only geometry."""
-SAMPLES = 4000
-"""Points on each shape."""
+MESH_KINDS = (".stl", ".obj", ".ply")  # formats of meshes that contain only geometry
+SAMPLES = 4000  # points on each shape
 SAVING, SAVING_TIP = 0.12, 0.04
 """A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of all boxes."""
-ROUND = 0.9
-"""A cylinder replaces boxes if its volume is less than this share of their volume."""
-TURNED = 0.85
-"""Boxes are turned out of the link's axes if one box then has less than this share of its volume."""
+ROUND = 0.9  # a cylinder replaces boxes if its volume is less than this share of their volume
+TURNED = 0.85  # boxes are turned out of the link's axes if one box then has less than this share of its volume
 
 Points = Float[np.ndarray, "_ 3"]
 """Points, of any count in each use."""
@@ -157,12 +153,7 @@ def _sample(mesh: "trimesh.Trimesh") -> Points:
 
 
 def fit_shapes(points: Points) -> list[Shape]:
-    """Cover points on a body by a few boxes, or by a cylinder.
-
-    >>> corners = np.array([[x, y, z] for x in (0, 0.02) for y in (0, 0.03) for z in (0, 0.05)])
-    >>> [shape.size for shape in fit_shapes(corners)]
-    [(0.02, 0.03, 0.05)]
-    """
+    """Cover points on a body by a few boxes, or by a cylinder."""
     turn = _axes(points)
     local = points @ turn
     boxes = _cut(local, 3 if float(np.ptp(local, axis=0).max()) < 0.08 else 8, SAVING)

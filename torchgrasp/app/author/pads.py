@@ -23,10 +23,8 @@ from torchgrasp.hand.urdf import Joint, Link, Shape, Triple, Urdf
 
 TILT = math.radians(30)
 """Angle [rad] between the direction of motion and the contact of a round tip, towards the finger's end."""
-SHORT_ARM = 1e-3
-"""A joint whose axis passes a tip nearer than this [m] does not move it."""
-BESIDE = 0.003
-"""Distance [m] from a ray or a plane within which points of a surface count."""
+SHORT_ARM = 1e-3  # a joint whose axis passes a tip nearer than this [m] does not move it
+BESIDE = 0.003  # distance [m] from a ray or a plane within which points of a surface count
 
 Vector = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]

@@ -13,8 +13,7 @@ import numpy as np
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.urdf import SIZES, Joint, Link, Mimic, Shape, Triple, Urdf
 
-EFFORT, VELOCITY = 1.0, 3.0
-"""Drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands."""
+EFFORT, VELOCITY = 1.0, 3.0  # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
 LEAST_MASS, LEAST_SIZE = 1e-3, 5e-3
 """Least mass [kg] and edge [m] of a body without mass, so that simulators remain stable."""
 

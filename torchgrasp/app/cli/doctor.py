@@ -20,8 +20,7 @@ from torchgrasp.specs import Simulator
 
 CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", "safetensors")
 """Packages without which nothing runs."""
-SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}
-"""Simulators, and the extra that installs each."""
+SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}  # simulators, and the extra that installs each
 OPTIONAL = {"distributed": ("cluster", "`torchgrasp campaign --scheduler`")}
 """Packages of one command each: the extra that installs it, and the command."""
 

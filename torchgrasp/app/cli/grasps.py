@@ -203,8 +203,7 @@ class Grasp(Command):
         return dataclasses.replace(scene, target=plan.best.label), plan.best.grasps, plan.best.shape
 
 
-STAGES = ("shape", "plan", "certify", "query", "refine")
-"""Stages of planning, as the planner reports them."""
+STAGES = ("shape", "plan", "certify", "query", "refine")  # stages of planning, as the planner reports them
 
 
 def write_results(out: Path, run: Run, no_report: bool) -> str:

@@ -23,8 +23,7 @@ from torchgrasp.testing.hands import find_faults, most_met, random_joints
 
 FREE, FACING, CLOSING = 0.2, 0.02, 0.001
 """Least shares of random postures that are free, face a pad to the others, and can hold an object; three fingers."""
-TRIAL_STARTS = 100
-"""Initial guesses with which a hand is tried on a shipped object."""
+TRIAL_STARTS = 100  # initial guesses with which a hand is tried on a shipped object
 
 
 @arguments(path="out")

@@ -20,8 +20,7 @@ from torchgrasp.posture_model.sample import SampleSpec, Sampling, sample_configu
 from torchgrasp.posture_model.score import bic_curve, evaluate_mixture
 from torchgrasp.testing import check_hand
 
-STARTS = 5
-"""Starts of k-means, as for the shipped models."""
+STARTS = 5  # starts of k-means, as for the shipped models
 
 
 @arguments()

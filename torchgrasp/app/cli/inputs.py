@@ -30,8 +30,7 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import Simulator
 from torchgrasp.values import PointCloud
 
-MOST_POINTS = 100_000
-"""Most points of a file that are used; a shape is fitted to fewer."""
+MOST_POINTS = 100_000  # most points of a file that are used; a shape is fitted to fewer
 CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv)"
 OUT_CLOUD_HELP = "point cloud to write (.npz or .ply), in metres"
 HAND_HELP = "name of a shipped hand (allegro, barrett, leap, shadow), or the folder of another hand"

@@ -17,8 +17,7 @@ HAND, OBJECT, TABLE = "#a9b0ba", "#e9d7b3", "#eceae4"
 """Colours of the palm with parked fingers, of the object, and of the table."""
 PAPER, INK, GRID, ALARM = "#fcfcfa", "#22262b", "#dcdad3", "#c2452d"
 """Colours of the background, of lines with text, of grid lines, and of the moment at which an object was lost."""
-SIZE = (720, 576)
-"""Width and height of a still [pixels]: twice its size on a page of three columns."""
+SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a page of three columns
 
 
 class Canvas:

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 WIDTH, STILL, TITLE = 1680, 340, 44
 """Width of the strip, height of its stills with titles, and height of a title [pixels]."""
-LETTERS = "abcdef"
-"""Names of the moments in stills and plots."""
+LETTERS = "abcdef"  # names of the moments in stills and plots
 
 
 def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction) -> bytes:

@@ -11,8 +11,7 @@ from torchgrasp.errors import Status
 from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE, SLIP_ANGLE, SLIP_DISTANCE
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 
-LOST = "lost"
-"""Name of the moment at which an object was lost."""
+LOST = "lost"  # name of the moment at which an object was lost
 
 
 class Moment(NamedTuple):

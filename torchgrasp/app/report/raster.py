@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-SAMPLES = 2
-"""Samples of a pixel along each axis; the mean of the samples gives smooth edges."""
+SAMPLES = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
 
 
 class Triangles(NamedTuple):

@@ -12,10 +12,8 @@ from torchgrasp.app.report.canvas import FINGERS, HAND
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import Shape, read_urdf
 
-PARKED = -1
-"""Finger index of a link that no grasping finger owns, such as the palm."""
-EDGE = 0.004
-"""Largest radius of a rounded edge [m], about that of a robot finger."""
+PARKED = -1  # finger index of a link that no grasping finger owns, such as the palm
+EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot finger
 
 
 class Solid(NamedTuple):

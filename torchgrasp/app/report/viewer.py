@@ -28,8 +28,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 from torchgrasp.values import Grasps
 
-VIEW = "view.html"
-"""Name of the page beside the report."""
+VIEW = "view.html"  # name of the page beside the report
 MOST_GRASPS, MOST_FACES, MOST_TICKS = 20, 40_000, 120
 """Most grasps, faces of a mesh and ticks of a replay, so that a page has a few megabytes."""
 POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")

@@ -9,14 +9,11 @@ from torchgrasp.control.observation import STILL, Observation
 from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.tactile import NOISE
 
-SETTLED = 0.1
-"""Time [s] for which a closing's end must hold before the closing is done."""
+SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
 
-POSE_TIME = 0.4
-"""Time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze."""
+POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
 
-STOP_FORCE = 0.5
-"""Force [N] at which the position controller stops a finger (Sec. 6.5)."""
+STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
 
 
 class PaperClosing:

@@ -25,11 +25,9 @@ from torchgrasp.control.tactile import low_pass
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
 from torchgrasp.plan.forces import grasp_map, internal_forces
 
-TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0
-"""Stiffness of the virtual frame [N/m, N m/rad]."""
+TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0  # stiffness of the virtual frame [N/m, N m/rad]
 
-GRASP_STIFFNESS = 100.0
-"""Stiffness [N/m] of the spring along each side of the triangle of fingertips."""
+GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the triangle of fingertips
 
 
 def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:

@@ -26,14 +26,11 @@ from torchgrasp.posture_model.gaussian import GaussianMixture
 STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "logL3"), ("logF1", "logF2", "logF3")
 """Logarithms of spring stiffness [N/m], of the tips' distances from their virtual frame [m], of normal forces [N]."""
 
-NAMES = (*STIFFNESS, *LENGTHS, *FORCES)
-"""Components of the state of a grasp."""
+NAMES = (*STIFFNESS, *LENGTHS, *FORCES)  # components of the state of a grasp
 
-LEAST_FORCE = 0.05
-"""Least normal force [N] of a finger in a state."""
+LEAST_FORCE = 0.05  # least normal force [N] of a finger in a state
 
-FILE = "stability.safetensors"
-"""Name of the model in the hand's folder."""
+FILE = "stability.safetensors"  # name of the model in the hand's folder
 
 PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "means", "covariances")]
 """Tensors of a model file."""
@@ -74,13 +71,6 @@ class StabilityModel(Value):
 
     Raises:
         BadArgument: other names, or a share outside (0, 1).
-
-    >>> from torchgrasp import load_hand
-    >>> model = load_stability(load_hand("allegro"))
-    >>> firm = model.stable.mean()
-    >>> weak = torch.cat([firm[:6], firm[6:] / 8])  # forces are last
-    >>> bool(model.log_odds(firm) > model.log_odds(weak))
-    True
     """
 
     stable: GaussianMixture
@@ -155,10 +145,6 @@ def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel
     Raises:
         ModelFileError: the file is missing or malformed.
         BadArgument: it is the model of another hand.
-
-    >>> from torchgrasp import load_hand
-    >>> load_stability(load_hand("leap")) is None, load_stability(load_hand("allegro")).share > 0.5
-    (True, True)
     """
     if path is None:
         path = hand.urdf_path.parent / FILE

@@ -17,22 +17,15 @@ from torchgrasp.geometry.plane import LEAST_TILT
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import PROBES, SymmetryScorer
 
-HALF_WEIGHT = 0.004
-"""Distance [m] of a normal's line from the axis at which it has half the weight in the fit."""
-STEEP = 0.3
-"""Least length of the level part of the normals that fit a vertical axis."""
+HALF_WEIGHT = 0.004  # distance [m] of a normal's line from the axis at which it has half the weight in the fit
+STEEP = 0.3  # least length of the level part of the normals that fit a vertical axis
 MISS, LEAST_RADIUS = 0.2, 0.01
 """A normal meets the axis if its line passes it within this share of the point's radius, at least of this one [m]."""
-ROUNDNESS, ROUND_ERROR = 0.055, 0.0018
-"""Usual miss of a body's normals: a share of the radius and an error [m]."""
-MAX_SPREAD = 0.075
-"""Greatest RMS of the relative misses of an upright body's normals."""
-BODY_SHARE = 0.6
-"""Least share of the cloud on the body; other points are an attached part."""
-MAX_COST = 1.0
-"""Greatest mean of log(1 + (miss / HALF_WEIGHT)^2) of an axis."""
-MAX_FREE = 0.12
-"""Greatest share of the rotated body in free space."""
+ROUNDNESS, ROUND_ERROR = 0.055, 0.0018  # usual miss of a body's normals: a share of the radius and an error [m]
+MAX_SPREAD = 0.075  # greatest RMS of the relative misses of an upright body's normals
+BODY_SHARE = 0.6  # least share of the cloud on the body; other points are an attached part
+MAX_COST = 1.0  # greatest mean of log(1 + (miss / HALF_WEIGHT)^2) of an axis
+MAX_FREE = 0.12  # greatest share of the rotated body in free space
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,16 +41,6 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
     The frame is `axis_from_cloud`; its x axis points towards the cameras. The axis is fitted to the scorer's probes.
     The body rotated about it must keep out of free space and of the table.
-
-    >>> from torchgrasp.values import PointCloud
-    >>> angle, along = torch.rand(2, 900, generator=torch.Generator().manual_seed(0)).double()
-    >>> angle = 2.8 * angle - 1.4
-    >>> normals = torch.stack([angle.cos(), 0 * angle, angle.sin()], 1)
-    >>> points = 0.03 * normals + torch.stack([0 * angle, 0.12 * along, 0 * angle], 1)
-    >>> seen = PointCloud(points, normals, torch.tensor([0.5, 0.06, 0.0]).double())
-    >>> axis_from_cloud, body = find_axis(SymmetryScorer.of(seen, None))
-    >>> [round(abs(float(x)), 2) for x in axis_from_cloud[2, :3]]
-    [0.0, 1.0, 0.0]
     """
     center, direction, cost = _fit_axis(scorer.probes, scorer.probe_normals)
     if not cost < MAX_COST:
@@ -80,13 +63,7 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
 
 def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Revolution | None:
-    """Return the upright body of revolution that most points belong to; None: there is none.
-
-    >>> angle = torch.linspace(-1.5, 1.5, 200).double()
-    >>> level = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
-    >>> find_revolution(0.03 * level + torch.tensor([0.1, 0.2, 0.0]).double(), level).center
-    tensor([0.1000, 0.2000], dtype=torch.float64)
-    """
+    """Return the upright body of revolution that most points belong to; None: there is none."""
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
     body = _split_body(points, lines, center)

@@ -28,16 +28,12 @@ from torchgrasp.values import PointCloud
 
 HULL_MARGIN, FRONT_MARGIN = 0.001, 0.002
 """A hidden point may be this far [m] outside the hull, and in front of the visible surface or below the table."""
-NEW, SPACING = 0.006, 0.004
-"""Least distance [m] of a hidden point from the cloud and from another hidden point."""
-LEAST_NOISE = 0.003
-"""Standard deviation [m] of a mirrored point of an object that is symmetric about that very plane."""
+NEW, SPACING = 0.006, 0.004  # least distance [m] of a hidden point from the cloud and from another hidden point
+LEAST_NOISE = 0.003  # standard deviation [m] of a mirrored point of an object that is symmetric about that very plane
 SYMMETRIC, ASYMMETRY = 0.45, 0.060
 """Score from which on an object counts as symmetric, and its asymmetry [m] for each 1 of score that is missing."""
-PART = 0.02
-"""Length scale [m] of the asymmetry: a part without a mirror image is missing as a whole."""
-TEMPERATURE = 0.1
-"""A plane's probability is proportional to exp(score / temperature)."""
+PART = 0.02  # length scale [m] of the asymmetry: a part without a mirror image is missing as a whole
+TEMPERATURE = 0.1  # a plane's probability is proportional to exp(score / temperature)
 NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045
 """Planes compared with a plane for its uncertainty: steps of each axis, greatest angle [rad] and shift over the
 cloud's size."""
@@ -112,12 +108,6 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
 
     The cloud is clean, with outward normals and viewpoints; others raise `BadArgument`. The table has its height [m]
     and normal z.
-
-    >>> from torchgrasp.geometry.linalg import unit
-    >>> eye = torch.tensor([0.0, 0.0, 1.0]).double()
-    >>> cap = unit(torch.rand(300, 3).double() - torch.tensor([0.5, 0.5, 0.0]).double())
-    >>> bool(complete_cloud(PointCloud(0.05 * cap, cap, eye)).points[:, 2].min() < -0.02)
-    True
     """
     if cloud.normals is None or cloud.viewpoint is None:
         raise BadArgument("cloud", "no normals or no viewpoint", "outward normals and viewpoints: see prepare_cloud")

@@ -19,14 +19,12 @@ INDEPENDENT, INDEPENDENT_RIM = 60, 8
 """Points of the cloud and of the outline that count as independent: neighbours are correlated."""
 POINT_NOISE, SLOPE_NOISE, RIM_NOISE, TABLE_NOISE = 0.001, 0.15, 0.002, 0.001
 """Standard deviations of a point [m], of its normal, of the outline [m] and of the table [m]."""
-ELONGATION = 0.03
-"""Standard deviation of the logarithm of an axis over the mean axis."""
+ELONGATION = 0.03  # standard deviation of the logarithm of an axis over the mean axis
 MAX_MISFIT, MAX_RELATIVE_MISFIT = 0.00165, 0.052
 """Greatest RMS distance of the cloud from the ellipsoid, in metres and in mean radii."""
 FORWARD = float(np.sqrt(np.finfo(float).eps))
 """The same while it is fitted, over a parameter or 1, whichever is more: half the digits."""
-UPPER = np.triu_indices(3)
-"""Entries of a symmetric matrix that are parameters."""
+UPPER = np.triu_indices(3)  # entries of a symmetric matrix that are parameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,14 +49,6 @@ def find_ellipsoid(
     """Return the ellipsoid, nearly a ball, that fits the whole cloud; None: it is no ball.
 
     The body may be flat where it stands: its ellipsoid may reach below the table, not hang above it.
-
-    >>> from torchgrasp.shape.completion.silhouette import silhouettes
-    >>> from torchgrasp.values import PointCloud
-    >>> camera, ball = torch.tensor([0.0, 0.5, 0.2]).double(), fibonacci_sphere(2000)
-    >>> seen = PointCloud(0.03 * ball[ball @ camera > 0.03], ball[ball @ camera > 0.03], camera)
-    >>> found = find_ellipsoid(seen.points, seen.normals, silhouettes(seen), None)
-    >>> bool((found.points.norm(dim=1) - 0.03).abs().max() < 0.001)
-    True
     """
     rows = farthest_points(points, 300, tie=TIE)
     fit = _Fit(points[rows].numpy(), normals[rows].numpy(), outline, table)

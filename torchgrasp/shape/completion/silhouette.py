@@ -16,10 +16,8 @@ from torchgrasp.values import PointCloud
 
 GROW, SHRINK = 2.0, 1.65
 """The outline is the union of discs about the pixels, then shrunk; both in spacings of the pixels."""
-FRONT_MARGIN = 0.002
-"""A point may be this far [m] in front of the visible surface: noise of the camera."""
-MAX_BEHIND = 0.2
-"""Greatest share of points behind others in a single view."""
+FRONT_MARGIN = 0.002  # a point may be this far [m] in front of the visible surface: noise of the camera
+MAX_BEHIND = 0.2  # greatest share of points behind others in a single view
 TIE = 2e-9
 """Relative difference of squared distances that rounding can make: the frame must not decide between equal ones."""
 
@@ -37,14 +35,6 @@ class Silhouette(Value):
         rim_normals: normals there of the cone that the camera and the outline span.
         cut: whether the object reaches the border of the image. Beyond it nothing is outside the outline.
         gap: greatest width [m] of a part within the outline where nothing was measured; 0: none. It may be a hole.
-
-    >>> from torchgrasp import load_object
-    >>> jug = load_object("jug").view
-    >>> view, middle = silhouettes(jug).views[0], jug.points.mean(0, keepdim=True)
-    >>> bool(view.hull_distance(middle) < 0), bool(view.violation(2 * middle) > 0), view.cut
-    (True, True, False)
-    >>> len(view.moved(torch.eye(4).double()).rim) == len(view.rim)
-    True
     """
 
     viewpoint: Float[Tensor, "3"]
@@ -92,16 +82,7 @@ class Silhouette(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Outlines(Value):
-    """The silhouettes of all views of one object; each view's bounds hold.
-
-    >>> from torchgrasp import load_object
-    >>> seen = silhouettes(load_object("jug").view)
-    >>> beside = torch.tensor([[0.5, 0.0, 0.1]]).double()  # nothing hides it from the camera
-    >>> bool(seen.hull_distance(beside) > 0), bool(seen.violation(beside) > 0)
-    (True, True)
-    >>> len(seen.moved(torch.eye(4).double()).views)
-    1
-    """
+    """The silhouettes of all views of one object; each view's bounds hold."""
 
     views: tuple[Silhouette, ...]
 
@@ -148,10 +129,6 @@ def silhouettes(cloud: PointCloud) -> Outlines:
     Raises:
         BadArgument: a cloud without viewpoint, part of a view is beside or behind its camera, or a view shows both
             sides of the object.
-
-    >>> cap = torch.rand(99, 3).double() * torch.tensor([0.1, 0.1, 0.01])
-    >>> len(silhouettes(PointCloud(cap, viewpoint=torch.tensor([0.0, 0.0, 9.0]).double())).views)
-    1
     """
     views = cloud.split_views()
     for view in views:

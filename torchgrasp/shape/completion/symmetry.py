@@ -14,24 +14,18 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
 
-MATCH_DISTANCE = 0.003
-"""Distance [m] over which a mirrored point stops matching the cloud."""
-PROBES = 150
-"""Points of the cloud that score a plane."""
-OFFSETS, FINE_OFFSETS = 17, 65
-"""Offsets tried for each direction of a plane, and for a known direction."""
+MATCH_DISTANCE = 0.003  # distance [m] over which a mirrored point stops matching the cloud
+PROBES = 150  # points of the cloud that score a plane
+OFFSETS, FINE_OFFSETS = 17, 65  # offsets tried for each direction of a plane, and for a known direction
 MIN_FACING, FACING = 0.35, 0.7
 """Cosine of a plane's normal with the view below which the plane hides no points, and above which it is frontal."""
 RIM_PRIOR = 0.15
 """Loss of score at a quarter of the cloud's size from the rim, without a table: a view ends near the mirror plane."""
-WITHIN = 0.12
-"""Greatest loss of score against the best plane."""
+WITHIN = 0.12  # greatest loss of score against the best plane
 APART = math.cos(math.radians(25.0))
 """Cosine of the least angle between two planes: closer ones mirror to the same points."""
-MAX_VIOLATION = 0.15
-"""Greatest mean violation of free space, in [0, 1], of a plane added for the points that it hides."""
-SLOPE = 0.15
-"""A plane near the best one is dropped if its score is less by this: it matches only because it is near."""
+MAX_VIOLATION = 0.15  # greatest mean violation of free space, in [0, 1], of a plane added for the points that it hides
+SLOPE = 0.15  # a plane near the best one is dropped if its score is less by this: it matches only because it is near
 AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.4
 """The axis of a body of revolution in its frame, and the least score of the plane that mirrors its ends."""
 

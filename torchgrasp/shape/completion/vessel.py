@@ -14,14 +14,12 @@ from torchgrasp.shape.completion.complete import FRONT_MARGIN, HULL_MARGIN, NEW,
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.values import PointCloud
 
-LEVEL = 0.5
-"""Least length of the horizontal part of a wall's normals: others are of rim, floor and noise."""
+LEVEL = 0.5  # least length of the horizontal part of a wall's normals: others are of rim, floor and noise
 BODY_SHARE, INNER_SHARE, OUTER_SHARE = 0.65, 0.09, 0.07
 """Least share of the walls' points on the body, and of the cloud on the inner and on the outer wall."""
 USUAL, SPREAD, THICKNESS_ERROR = 0.0035, 0.0015, 0.0012
 """Usual thickness [m] of household vessels, its standard deviation, and the standard deviation of one fit."""
-RIM = 0.003
-"""Points so near [m] below the rim belong to no wall: their normals depend on both walls."""
+RIM = 0.003  # points so near [m] below the rim belong to no wall: their normals depend on both walls
 CENTER_ERROR, FORM_ERROR, FLOOR_ERROR = 0.0006, 0.001, 0.003
 """Standard deviations [m] of the axis, of real walls about a surface of revolution, and of an unseen floor."""
 
@@ -52,13 +50,6 @@ def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> 
 
     Normals of an inner wall point to the axis. Both walls are fitted at once: the radius is a cubic in the height,
     less thickness / slope of the normal inside. Reweighted least squares (Cauchy) ignore ears and handles.
-
-    >>> angle, height = torch.rand(2, 900, generator=torch.Generator().manual_seed(0)).double()
-    >>> level = torch.stack([(6.3 * angle).cos(), (6.3 * angle).sin(), torch.zeros_like(angle)], 1)
-    >>> sign = torch.where(torch.arange(900) % 2 == 0, 1.0, -1.0).double()[:, None]
-    >>> points = (0.035 + 0.002 * sign) * level + height[:, None] * torch.tensor([0.0, 0.0, 0.07]).double()
-    >>> round(find_vessel(points, sign * level).thickness, 4)
-    0.0038
     """
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     level = normals[:, :2] / slope[:, None].clamp_min(1e-9)
