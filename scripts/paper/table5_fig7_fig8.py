@@ -21,7 +21,7 @@ from torchgrasp import Hand, load_hand, load_mixture
 from torchgrasp.app.report.canvas import FINGERS, GRID, INK, PAPER, Canvas, Direction
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.files import write_file
-from torchgrasp.posture_model.encoding import encode_fingertips
+from torchgrasp.posture_model.mixture import encode_fingertips
 from torchgrasp.posture_model.sample import sample_configurations
 
 PUBLISHED = {

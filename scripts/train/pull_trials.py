@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.closure import ClosingOptions
-from torchgrasp.control.observation import Observation, Targets
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.tactile import Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.geometry.frames import rotation_angle

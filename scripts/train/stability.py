@@ -30,7 +30,7 @@ from torchgrasp import (
 )
 from torchgrasp.base import Batch
 from torchgrasp.control import ClosingReference
-from torchgrasp.control.paper.impedance import Impedance
+from torchgrasp.control.paper.closings import Impedance
 from torchgrasp.control.paper.stability import FILE, NAMES, StabilityModel, lengths_of, state_of
 from torchgrasp.errors import BadArgument, GraspError
 from torchgrasp.evaluation.trial import GraspTrial
@@ -38,10 +38,9 @@ from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.jobs import run_tasks
-from torchgrasp.posture_model.em import Shard, expectation_maximisation
-from torchgrasp.posture_model.encoding import describe_compatibility
+from torchgrasp.posture_model.em import Shard, expectation_maximisation, start_components
 from torchgrasp.posture_model.gaussian import GaussianMixture
-from torchgrasp.posture_model.kmeans import start_components
+from torchgrasp.posture_model.mixture import describe_compatibility
 from train.pull_trials import PullRecord, RisingPull, pull_until_lost
 
 SIZES = {

@@ -12,7 +12,7 @@ from tests.campaign.conftest import LIFT, QUICK
 from torchgrasp import ContactSpec, Status, certify, load_hand
 from torchgrasp.app import cli
 from torchgrasp.campaign import CampaignSpec, run_campaign
-from torchgrasp.campaign import job as job_module
+from torchgrasp.campaign import cluster as job_module
 from torchgrasp.data import read_shards, read_view
 from torchgrasp.errors import BadArgument, DatasetError
 from torchgrasp.evaluation import EvaluationSpec, evaluate

@@ -5,8 +5,7 @@ import trimesh
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.check import remove_outliers, voxel_downsample
 from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
-from torchgrasp.cloud.merge import merge_clouds
-from torchgrasp.cloud.prepare import clean_cloud
+from torchgrasp.cloud.prepare import clean_cloud, merge_clouds
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.data.shipped import load_object
 from torchgrasp.errors import BadArgument, TooFewPoints

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.make import ball
-from torchgrasp.cloud import check, diagnose, merge, prepare
+from torchgrasp.cloud import check, diagnose, prepare
 from torchgrasp.errors import BadArgument, GraspError, SuspiciousScale, TooFewPoints
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
@@ -21,7 +21,7 @@ FUNCTIONS = {
     "estimate_normals": prepare.estimate_normals,
     "clean_cloud": prepare.clean_cloud,
     "prepare_cloud": lambda cloud: prepare.prepare_cloud(cloud, torch.Generator()),
-    "merge_clouds": lambda cloud: merge.merge_clouds([cloud, cloud], [torch.eye(4).double()] * 2),
+    "merge_clouds": lambda cloud: prepare.merge_clouds([cloud, cloud], [torch.eye(4).double()] * 2),
     "diagnose_cloud": diagnose.diagnose_cloud,
     "fit_shape": fit_shape,
     "fit_shape paper": lambda cloud: fit_shape(cloud, support="paper"),
@@ -191,7 +191,7 @@ def test_outliers_go_lengths_do_not_matter_and_zero_is_refused():
 def test_every_function_on_clouds_is_in_the_table():
     public = {
         name
-        for module in (check, merge, prepare, diagnose)
+        for module in (check, prepare, diagnose)
         for name, function in inspect.getmembers(module, inspect.isfunction)
         if function.__module__ == module.__name__ and not name.startswith("_")
         if "cloud" in str(inspect.signature(function))

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
-from torchgrasp.control.grip import MIN_PUSH, PRIOR_STD, FrictionEstimate, GripHold
+from torchgrasp.control.holding import MIN_PUSH, PRIOR_STD, FrictionEstimate, GripHold
 from torchgrasp.control.least_forces import LeastForces, balance, friction_ratios
-from torchgrasp.control.observation import Observation
+from torchgrasp.control.tactile import Observation
 from torchgrasp.errors import Status
 from torchgrasp.geometry.plane import Plane
 

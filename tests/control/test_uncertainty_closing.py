@@ -10,9 +10,9 @@ from tests.point_fingers import FREE, GAINS, NORMALS, PERIOD, TARGET, TOUCHING, 
 from torchgrasp.closure import NO_OPTIONS, ClosingOptions
 from torchgrasp.control import ClosingReference, GraspController, TipContact, measure, no_contact
 from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, position_gain, surface_covariance
-from torchgrasp.control.observation import Observation
 from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing, PositionClosing
 from torchgrasp.control.sensing import WAITING_FORCE
+from torchgrasp.control.tactile import Observation
 from torchgrasp.control.uncertainty_closing import LEAD, PATIENCE, QUICK_TOUCH, UncertaintyClosing, with_equal_gains
 from torchgrasp.geometry.plane import Plane
 

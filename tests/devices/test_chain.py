@@ -42,7 +42,7 @@ from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.silhouette import silhouettes
-from torchgrasp.testing.hands import random_joints
+from torchgrasp.testing import random_joints
 
 SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
 VIEW, UP = load_object("cylinder").view, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -33,7 +33,7 @@ from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.plan import least_friction_forces
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
-from torchgrasp.testing.hands import random_joints
+from torchgrasp.testing import random_joints
 
 SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
 VIEW = load_object("cylinder").view

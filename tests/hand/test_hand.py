@@ -10,7 +10,7 @@ from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.testing.hands import largest_fk_error, random_joints
+from torchgrasp.testing import largest_fk_error, random_joints
 
 HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("allegro", "four"), ("barrett", "default")]
 HANDS += [("leap", "default"), ("shadow", "default")]

@@ -9,7 +9,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.testing.hands import random_joints, reference_poses
+from torchgrasp.testing import random_joints, reference_poses
 
 BRANCHED = """<robot name="branched">
   <link name="tip"/><link name="base"/><link name="slider"/><link name="arm"/><link name="side"/><link name="bolt"/>

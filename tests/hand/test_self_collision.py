@@ -12,8 +12,7 @@ from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import Mimic, read_urdf
-from torchgrasp.testing import check_hand
-from torchgrasp.testing.hands import random_joints
+from torchgrasp.testing import check_hand, random_joints
 
 HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
 

@@ -13,8 +13,7 @@ from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.specs import ContactSpec
-from torchgrasp.testing import check_hand
-from torchgrasp.testing.hands import random_joints
+from torchgrasp.testing import check_hand, random_joints
 
 README = (hands_folder() / "README.md").read_text("utf-8")
 SHIPPED = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))

@@ -20,7 +20,7 @@ from torchgrasp import PointCloud, fit_shape, load_hand, load_object, load_scene
 from torchgrasp.checks import Range
 from torchgrasp.cloud import estimate_normals
 from torchgrasp.control import ClosingReference, GraspController, no_contact, observe
-from torchgrasp.control.paper.impedance import Impedance
+from torchgrasp.control.paper.closings import Impedance
 from torchgrasp.control.paper.stability import NAMES, StabilityModel
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import Status
@@ -30,7 +30,7 @@ from torchgrasp.plan import Shape
 from torchgrasp.planner.explain import Funnel, Losses
 from torchgrasp.posture_model import GaussianMixture, GraspMixture, SampleSpec, write_samples
 from torchgrasp.posture_model.dataset import SampleFolder
-from torchgrasp.posture_model.encoding import CODE_NAMES
+from torchgrasp.posture_model.mixture import CODE_NAMES
 from torchgrasp.shape import Kernel, thin_plate_kernel
 from torchgrasp.shape.completion.complete import Completion, complete_cloud
 from torchgrasp.shape.completion.silhouette import Outlines, Silhouette, silhouettes

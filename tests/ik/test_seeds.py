@@ -15,9 +15,8 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, collision_cost
 from torchgrasp.ik.seeds import WRONG_SIDE, PostureLibrary, nearest_postures, query_mixture
-from torchgrasp.posture_model.encoding import PERMUTATIONS
 from torchgrasp.posture_model.fit import fit_mixture
-from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, load_mixture
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PERMUTATIONS, GraspMixture, load_mixture
 from torchgrasp.posture_model.sample import HandSamples, sample_configurations
 from torchgrasp.values import Contacts
 

@@ -7,8 +7,8 @@ from tests.make import touched_contacts
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
 from torchgrasp.hand.load import load_hand
+from torchgrasp.ik.attempts import refine_by_cobyla
 from torchgrasp.ik.clearance import CollisionWorld
-from torchgrasp.ik.cobyla import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.seeds import PostureLibrary
 from torchgrasp.ik.solve import solve_ik

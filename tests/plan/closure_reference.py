@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.closure import closed_exact
+from torchgrasp.plan.closure import closed_exact, tangents
 from torchgrasp.plan.closure_probability import FOOTPRINT
-from torchgrasp.plan.wrench import tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import distance_covariance
 from torchgrasp.values import Contacts

@@ -14,7 +14,7 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan import closure
 from torchgrasp.plan.certify import bound_margin, certify
-from torchgrasp.plan.wrench import wrenches
+from torchgrasp.plan.closure import wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 

@@ -11,10 +11,10 @@ from tests.make import CUP_RADIUS as RADIUS
 from tests.make import cup_view
 from tests.make import cylinder_points as ring
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.plan.closure import tangents
 from torchgrasp.plan.feasibility import GUIDING_POINTS, INSIDE, flatness_constraint, normal_variation
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.wrench import tangents
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.hollow import HollowShape
 

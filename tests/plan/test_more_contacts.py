@@ -14,8 +14,16 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, degenerate, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.closure import closed_exact, first_balance, most_opposing, solve_closure_lp
-from torchgrasp.plan.wrench import MIN_MARGIN, cone_edges, tangents, wrenches
+from torchgrasp.plan.closure import (
+    MIN_MARGIN,
+    closed_exact,
+    cone_edges,
+    first_balance,
+    most_opposing,
+    solve_closure_lp,
+    tangents,
+    wrenches,
+)
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 

@@ -10,11 +10,11 @@ from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
+from torchgrasp.plan.closure import wrenches
 from torchgrasp.plan.feasibility import check_feasibility, first_violation, normal_variation
 from torchgrasp.plan.solve import plan_chunk, plan_contacts
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.starts import draw_in, settle_flatness
-from torchgrasp.plan.wrench import wrenches
 from torchgrasp.specs import ContactSpec
 
 SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, flatness=0.6, flat_radius=0.008)}

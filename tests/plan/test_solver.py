@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchgrasp.data.shipped import load_object
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.plan.closure import rank_ratio, wrenches
 from torchgrasp.plan.problem import ContactProblem, forces_from_tensions
 from torchgrasp.plan.solve import plan_contacts
 from torchgrasp.plan.solver import (
@@ -21,7 +22,6 @@ from torchgrasp.plan.solver import (
     promised_decrease,
     start_state,
 )
-from torchgrasp.plan.wrench import rank_ratio, wrenches
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.specs import ContactSpec
 

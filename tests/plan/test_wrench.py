@@ -10,9 +10,9 @@ from torch import Tensor
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
-from torchgrasp.plan.closure import closed_exact
-from torchgrasp.plan.wrench import (
+from torchgrasp.plan.closure import (
     centre_and_radius,
+    closed_exact,
     cone_edges,
     rank_ratio,
     tangents,

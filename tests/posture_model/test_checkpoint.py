@@ -11,9 +11,8 @@ from tests.make import ring_samples as ring
 from tests.make import run_python
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import load_tensors
-from torchgrasp.posture_model.checkpoint import Checkpoint
 from torchgrasp.posture_model.em import Progress, Shard
-from torchgrasp.posture_model.fit import fit_mixture
+from torchgrasp.posture_model.fit import Checkpoint, fit_mixture
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture
 from torchgrasp.posture_model.sample import HandSamples
 

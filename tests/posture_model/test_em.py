@@ -19,8 +19,8 @@ from torchgrasp.posture_model.em import (
     expectation_maximisation,
     features_from_data,
     maximisation,
+    start_components,
 )
-from torchgrasp.posture_model.kmeans import start_components
 
 
 def clustered(n: int = 6000, d: int = 5, m: int = 4) -> torch.Tensor:

@@ -9,7 +9,7 @@ import torch
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rotate, virtual_frame
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.posture_model.encoding import PERMUTATIONS, encode, encode_fingertips
+from torchgrasp.posture_model.mixture import PERMUTATIONS, encode, encode_fingertips
 from torchgrasp.values import Contacts
 
 

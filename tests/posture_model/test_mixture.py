@@ -10,8 +10,7 @@ from scipy.stats import chi2
 
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import save_tensors
-from torchgrasp.posture_model.encoding import CODE_NAMES
-from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
+from torchgrasp.posture_model.mixture import CODE_NAMES, DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
 
 NAMES = ("a", "b", *CODE_NAMES)
 

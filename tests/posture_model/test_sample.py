@@ -5,7 +5,7 @@ import torch
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.load import load_hand
-from torchgrasp.posture_model.encoding import encode_fingertips
+from torchgrasp.posture_model.mixture import encode_fingertips
 from torchgrasp.posture_model.sample import sample_configurations
 
 

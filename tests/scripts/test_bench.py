@@ -22,8 +22,7 @@ from tests.pinch import cylinder, pinch
 from torchgrasp import Contacts, ContactSpec, PointCloud, certify, fit_shape, load_object
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.closure import solve_closure_lp
-from torchgrasp.plan.wrench import wrenches
+from torchgrasp.plan.closure import solve_closure_lp, wrenches
 
 RUNS = ("gpu/kernels", "hand/collision", "load/starts", "plan/truth", "scene/plane")
 SIMULATED = ("close/perturb", "grasp/lifts")

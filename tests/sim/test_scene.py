@@ -13,9 +13,15 @@ from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.mjcf import OBJECT
-from torchgrasp.sim.mount import APPROACH_JOINT, LIFT_JOINT, euler_from_rotation, mounted_urdf
 from torchgrasp.sim.scene import open_scene
-from torchgrasp.sim.scene_spec import SHIFT_JOINTS, SceneSpec
+from torchgrasp.sim.scene_spec import (
+    APPROACH_JOINT,
+    LIFT_JOINT,
+    SHIFT_JOINTS,
+    SceneSpec,
+    euler_from_rotation,
+    mounted_urdf,
+)
 
 
 def test_euler_angles_rebuild_the_rotation():

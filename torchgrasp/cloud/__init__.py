@@ -5,7 +5,7 @@ from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.check import check_cloud, remove_outliers, voxel_downsample
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.diagnose import CloudReport, diagnose_cloud, format_report
-from torchgrasp.cloud.merge import merge_clouds
+from torchgrasp.cloud.prepare import merge_clouds
 from torchgrasp.cloud.parts import cut_object
 from torchgrasp.cloud.prepare import NormalCheck, estimate_normals
 from torchgrasp.cloud.read import CloudFile, cloud_from_array, read_cloud, read_cloud_file, save_cloud

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from torchgrasp.cloud.tables import read_table
-from torchgrasp.files.meshes import load_triangles
+from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.limits import CLOUD_POINTS, TEXT_MESH_BYTES
 
 TYPES = {

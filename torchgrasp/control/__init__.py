@@ -3,7 +3,7 @@
 from torchgrasp.closure import ClosingGains
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.forces import squeeze
-from torchgrasp.control.observation import Observation, Targets, observe
+from torchgrasp.control.tactile import Observation, Targets, observe
 from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.sensing import FingertipSensor, feel_flags, feel_torques
 from torchgrasp.control.tactile import TactileState, TipContact, measure, no_contact

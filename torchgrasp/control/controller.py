@@ -11,12 +11,11 @@ from torch import Tensor
 from torchgrasp.base import check_device, settle
 from torchgrasp.checks import Range, checked
 from torchgrasp.closure import ClosingOptions, choose_options
-from torchgrasp.control.grip import GripHold
-from torchgrasp.control.holding import ForceHold, PositionHold
-from torchgrasp.control.observation import Observation, Targets
+from torchgrasp.control.holding import ForceHold, GripHold, PositionHold
 from torchgrasp.control.paper.closings import OpenLoopClosing, PaperClosing, PositionClosing
 from torchgrasp.control.recovery import PRESSING_TIME, GraspCheck, GuardedApproach, Reopening, can_guard
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.tactile import Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.specs import ClosingMode, HoldingMode, check_sensor
@@ -216,7 +215,7 @@ def choose_holding(
     """Return the constructor of a holding; only "impedance" reads the stability model."""
     if mode == "impedance":
         closing.reference.hand.require_three("holding", "'impedance', whose virtual frame is of three,")
-        from torchgrasp.control.paper.impedance import Impedance
+        from torchgrasp.control.paper.closings import Impedance
         from torchgrasp.control.paper.stability import load_stability
 
         return functools.partial(Impedance, stability=load_stability(closing.reference.hand))

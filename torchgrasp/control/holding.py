@@ -1,11 +1,16 @@
-"""How a closed hand presses: with balanced forces at the sensed contacts, or by keeping its joint targets."""
+"""How a closed hand presses: with the balanced forces of the plan, or with the least forces for the felt load."""
 
+import math
+
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.observation import Observation
+from torchgrasp.control.least_forces import Balance, LeastForces, balance, friction_ratios
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.tactile import Observation, low_pass
+from torchgrasp.errors import Status
 from torchgrasp.plan.forces import least_friction_forces
 
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
@@ -74,3 +79,195 @@ def held_forces(reference: ClosingReference, observation: Observation) -> tuple[
         if bool(torch.isfinite(balanced).all()):
             forces, normals = balanced, sensed.normals
     return forces, float(-((forces * normals).sum(-1) * reference.alive).sum())
+
+
+MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations of its reading
+
+PRIOR_STD, MIN_STD = 0.2, 0.03  # standard deviation of the friction estimate at the start, and its least value
+
+SLIDING = 0.008  # speed [m/s] from which a fingertip counts as sliding
+
+FORCE_LAG = 0.03  # time [s] of sliding until the filtered forces show the friction
+
+LIFTED = 0.35  # load [N] from which the object counts as lifted
+
+
+class FrictionEstimate:
+    """Mean and standard deviation of the friction of all fingertips on the object."""
+
+    def __init__(self) -> None:
+        self.mean, self.std = 0.8, PRIOR_STD
+
+    def update(self, ratio: float, force: float, lagging: bool = False) -> None:
+        """Revise the estimate by the ratio of tangential to normal force [N] of a sliding fingertip.
+
+        `lagging`: the fingertip has just begun to slide, so the ratio is less certain.
+        """
+        noise = (1 + lagging) * 0.4 * math.hypot(1.0, ratio) / force
+        weight = self.std**2 / (self.std**2 + noise**2)
+        self.mean = min(max(self.mean + weight * (ratio - self.mean), 0.15), 1.5)
+        self.std = max(self.std * math.sqrt(1 - weight), MIN_STD)
+
+    @property
+    def low(self) -> float:
+        """A friction that the true one probably exceeds."""
+        return max(self.mean - self.std, 0.15)
+
+    @property
+    def high(self) -> float:
+        """A friction that the true one probably does not reach."""
+        return self.mean + self.std
+
+
+class GripHold:
+    """Press with the least forces that carry the felt load.
+
+    `status` turns `TOO_HEAVY` when a fingertip slides at the limits of torque or force. `weight` [N] is the felt load.
+
+    Args:
+        reference, observation, start: as for `ForceHold`; no finger presses harder than `reference.max_force`.
+    """
+
+    def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
+        max_force = 1000.0 if reference.max_force is None else reference.max_force  # [N], no hand presses as hard
+        hand = reference.hand
+        self.reference, self.start, self.rest = reference, start, observation.joints
+        effort = np.array([hand.actuators[name].effort for name in hand.tree.joint_names])
+        forces, _ = held_forces(reference, observation)
+        self.normals, self.radius = _sensed(observation, reference.normals.numpy()), hand.tips.radius.numpy()
+        self.solver = LeastForces(forces.numpy().copy(), effort, max_force)
+        push = np.abs((forces.numpy() * self.normals).sum(-1))
+        self.planned = np.maximum(push, 0.01 * max(float(push.max()), MIN_PUSH))
+        self.grip, self.least = np.minimum(push, max_force), np.full(len(push), MIN_PUSH)
+        self.felt, self.load, self.carried = np.zeros((len(push), 3)), np.zeros(6), np.zeros(6)
+        self.up = None if reference.table is None else reference.table.normal.numpy()
+        self.friction, self.optimism = FrictionEstimate(), 0.0
+        self.aim = self.friction.low
+        self.sent, self.trim, self.most = *np.zeros((2, len(push), 3)), 0.0
+        self.time = self.steady = self.over = 0.0
+        self.released = False
+        self.status, self.slid, self.creep = Status.OK, *np.zeros((2, len(push)))
+
+    @property
+    def weight(self) -> float:
+        """The felt load [N]."""
+        return float(np.linalg.norm(self.load[:3]))
+
+    def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
+        """Return the targets of all joints for the next tick."""
+        self.time += period
+        jacobian, fastest_rise = observation.jacobian.numpy(), 60.0  # [N/s]
+        contacts = self._feel(observation, period)
+        self._adapt(observation, period)
+        wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, self._floor())
+        self._judge(wanted, jacobian, period)
+        step = self._command(contacts, wanted, period) - self.sent
+        length = np.linalg.norm(step, axis=-1, keepdims=True)
+        self.sent = self.sent + step * np.minimum(1.0, fastest_rise * period / np.maximum(length, 1e-9))
+        torque = np.einsum("cij,ci->j", jacobian, self.sent).clip(-self.solver.effort, self.solver.effort)
+        share = min(self.time / RAMP, 1.0)
+        lead = torch.from_numpy(torque) / self.reference.kp
+        return self.start + share * (self.rest + lead - self.start)
+
+    def _floor(self) -> np.ndarray:
+        """Return the least normal forces [N]; the limits leave a fifth of the force to the load."""
+        floor = np.maximum(self.grip, self.least)
+        largest = float((floor / self.planned).max() * self.planned.max())
+        return floor * min(1.0, 0.8 * self.solver.most / largest)
+
+    def _feel(self, observation: Observation, period: float) -> Balance:
+        """Filter forces, load and normals; return the grasp map of the fingertips."""
+        normals = _sensed(observation, self.normals)
+        self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
+        self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
+        contacts = balance(observation.tips.numpy() - self.radius[:, None] * self.normals)
+        forces = observation.tactile.forces.numpy()
+        self.felt = self.felt + low_pass(8.0, period) * (forces - self.felt)
+        load = self._weight(contacts.wrench @ forces.ravel())
+        self.load = self.load + low_pass(3.0, period) * (load - self.load)
+        self.carried = self.carried + low_pass(0.7, period) * (load - self.carried)  # a faster one rocks the object
+        return contacts
+
+    def _weight(self, load: np.ndarray) -> np.ndarray:
+        """Return the part of a load that may be a weight: upwards above a known table, with an arm of at most 0.1 m."""
+        if self.up is None:
+            return load
+        lifted = max(float(load[:3] @ self.up), 0.0)
+        torque = load[3:] * min(1.0, 0.1 * lifted / max(float(np.linalg.norm(load[3:])), 1e-9))
+        return np.concatenate([lifted * self.up, torque])
+
+    def _adapt(self, observation: Observation, period: float) -> None:
+        """Press harder where a finger slides, revise the friction, and release needless force."""
+        speed = observation.tactile.sliding.numpy()
+        self.creep = self.creep + low_pass(1.0, period) * (speed.clip(max=SLIDING) - self.creep)
+        slides = (speed > SLIDING) & observation.tactile.contact.numpy()
+        starts = slides & (self.slid == 0.0)
+        self.slid = np.where(slides, self.slid + period, 0.0)
+        if self.time < RAMP:
+            return
+        push = -(self.felt * self.normals).sum(-1)
+        creeps = self.creep > 0.002  # [m/s]
+        slipped = (starts | creeps) & self.released  # after a slip each force stays well above the force at the slip
+        self.least = np.where(slipped, np.maximum(self.least, 1.3 * np.minimum(push, self.grip)), self.least)
+        ratios, pressing = friction_ratios(self.felt, self.normals), push > 0.5 * MIN_PUSH
+        for i in np.flatnonzero(slides & pressing):
+            self.friction.update(float(min(ratios[i], 2.0)), float(push[i]), bool(self.slid[i] <= FORCE_LAG))
+        if slides.any():
+            harder = np.maximum(self.grip, push) * (1 + 240.0 * period * speed.clip(min=0.0))  # twice each 3 mm
+            harder = np.where(slides, harder, self.grip)
+            self.grip = np.maximum(self.grip, harder * min(1.0, self._enough() / float(harder.sum())))
+        self._release(bool((slides | creeps | ~pressing).any()), period)
+
+    def _release(self, moving: bool, period: float) -> None:
+        """Reduce the forces of a lifted load that has been steady, then try less safe friction ratios."""
+        if moving:
+            self.optimism = 0.0
+        if moving or self.weight > 1.05 * self.most:
+            self.most, self.steady = max(self.most, self.weight), 0.0
+        self.steady += period
+        if self.steady < 0.3 or self.weight < LIFTED:
+            return
+        self.released = True
+        self.grip = np.maximum(self.grip * (1 - min(3.0 * period, 1.0)), np.minimum(self.least, self.grip))
+        if self.friction.std > 2 * MIN_STD and bool((self.grip < 1.2 * self.least).all()):
+            self.optimism += 0.1 * period
+
+    def _enough(self) -> float:
+        """Return an upper bound on the sum of normal forces [N] for the felt load; more would move the object."""
+        return 3.0 * (self.weight + 0.5) / self.friction.low
+
+    def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
+        """Choose the friction ratio to aim at, and find out whether the load is too heavy.
+
+        A load is too heavy if a finger slides at the limits: friction and normals are only estimates until then.
+        """
+        share, push = self.solver.share(self.normals, jacobian), -float((wanted * self.normals).sum())
+        goal = min(self.friction.low + self.optimism, self.friction.high)
+        if share > 1.0 or push > max(self._enough(), float(self.grip.sum())):
+            goal = self.friction.high
+        fastest = 2.0 * period
+        self.aim += min(max(goal - self.aim, -fastest), fastest)
+        beyond = share > 0.95 and bool((self.slid > FORCE_LAG).any())
+        self.over = self.over + period if beyond and self.weight > LIFTED else 0.0
+        if self.over > 0.25:  # [s]
+            self.status = Status.TOO_HEAVY
+
+    def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
+        """Return the forces of the drives: wanted forces, corrected by internal forces, less the carried load.
+
+        The drives carry four fifths of the load. Carrying all of it would press ever harder on a rigid table.
+        """
+        if self.time > RAMP:
+            lacking = ((self.felt - wanted) * self.normals).sum(-1)
+            self.trim = self.trim - period * 4.0 * lacking[:, None] * self.normals
+            flat = self.trim.ravel()
+            self.trim = (flat - contacts.inverse @ (contacts.wrench @ flat)).reshape(-1, 3)
+            largest, bound = (float(np.linalg.norm(x, axis=-1).max()) for x in (self.trim, 0.5 * wanted))
+            self.trim = self.trim * min(1.0, bound / max(largest, 1e-9))
+        return wanted + self.trim - (contacts.inverse @ (self.load - 0.8 * self.carried)).reshape(-1, 3)
+
+
+def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:
+    """Return the sensed normals, or given normals where nothing is sensed."""
+    sensed = observation.tactile.normals.numpy()
+    return np.where(np.isfinite(sensed).all(-1, keepdims=True), sensed, normals)

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.tactile import Observation
 from torchgrasp.geometry.frames import apply, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 

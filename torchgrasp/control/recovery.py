@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.object_pose import Localization, Touches
-from torchgrasp.control.observation import STILL, Observation
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane

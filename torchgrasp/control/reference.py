@@ -30,7 +30,7 @@ from torchgrasp.control.law import (
     position_gain,
     surface_covariance,
 )
-from torchgrasp.control.observation import Observation
+from torchgrasp.control.tactile import Observation
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit

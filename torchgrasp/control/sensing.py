@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.checks import Positive, checked
-from torchgrasp.control.observation import Observation
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import (
     FLAG_CUTOFF,
     NOISE,
     SAMPLING_RATE,
     TOUCH_ON,
+    Observation,
     TactileState,
     TipContact,
     flag,

@@ -1,8 +1,8 @@
-"""Tactile fingertips: their readings, and a model of their noise, lag and sampling."""
+"""Observations of a hand, and tactile fingertips: their readings, noise, lag and sampling."""
 
 import dataclasses
 import math
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgrasp.base import FINGERTIPS, Value, check_device
 from torchgrasp.checks import ANY, Count, Range, checked
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.hand.hand import Hand
 
 SAMPLING_RATE = 100.0  # samples of a fingertip a second [Hz]
 
@@ -149,3 +150,75 @@ def flag(before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: F
 def low_pass(cutoff: float, period: float) -> float:
     """Return the new value's share in a first-order low-pass, given cut-off [Hz] and period [s]."""
     return 1 - math.exp(-2 * math.pi * cutoff * period)
+
+
+STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays on its path
+
+
+class Targets(NamedTuple):
+    """Commands until the next tick.
+
+    Args:
+        joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
+        palm: displacement of the palm [m] from its path, in the axes of the hand. The wrist does not turn.
+        left: remaining length [m] of the approach; 0: the hand is at its pre-grasp.
+
+    >>> Targets(torch.zeros(16)).palm
+    tensor([0., 0., 0.], dtype=torch.float64)
+    """
+
+    joints: Float[Tensor, " j"]
+    palm: Float[Tensor, "3"] = STILL
+    left: float = 0.0
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Observation(Value):
+    """Joints, fingertips and touch at a tick, in the hand's frame.
+
+    Args:
+        joints: all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
+        tips: centres of the fingertips [m].
+        jacobian: of these centres by all joints [m/rad].
+        tactile: readings of the fingertips.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.control import no_contact
+    >>> hand = load_hand("barrett")
+    >>> observe(hand, (hand.lower + hand.upper) / 2, no_contact()).jacobian.shape
+    torch.Size([3, 3, 8])
+    """
+
+    joints: Float[Tensor, " j"]
+    tips: Float[Tensor, "f 3"]
+    jacobian: Float[Tensor, "f 3 j"]
+    tactile: TactileState
+
+
+@checked
+def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
+    """Return the observation of a robot with measured actuated joints [rad] and fingertip readings.
+
+    Raises:
+        BadArgument: joints or fingertips on another device than the hand.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.control import no_contact
+    >>> hand = load_hand("barrett")
+    >>> joints = (hand.lower + hand.upper) / 2
+    >>> torch.allclose(observe(hand, joints, no_contact()).tips, hand.tip_centres(joints))
+    True
+    """
+    check_device("tactile", tactile.lagged.device, "the hand", hand.lower.device)
+    joints = joints.double()
+    tips, everything = hand.tip_centres(joints), hand.expand_joints(joints)
+    return Observation(everything, tips, joint_jacobian(hand, everything, tips), tactile)
+
+
+def joint_jacobian(hand: Hand, joints: Float[Tensor, " j"], points: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3 j"]:
+    """Return the Jacobian of points on the fingertips [m/rad] by all joints of the URDF, each on its own."""
+    axes, origins = hand.tree.joint_axes(hand.tree.poses(joints[None])[0])
+    turning = torch.linalg.cross(axes.expand(len(points), -1, 3), points[:, None] - origins)
+    columns = torch.where(hand.tree.prismatic[:, None] > 0, axes, turning)
+    return (columns * hand.tree.moves[hand.tips.index][:, :, None]).transpose(1, 2)

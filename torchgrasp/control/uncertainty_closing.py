@@ -9,10 +9,10 @@ from torch import Tensor
 from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.law import POSITION_FLOOR, POSITION_RATE, blend, stay_above, tip_velocity
 from torchgrasp.control.object_pose import ContactPlanes
-from torchgrasp.control.observation import STILL, Observation
 from torchgrasp.control.paper.closings import SETTLED, Settled, strongest_lead
 from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.sensing import WAITING_FORCE, DriveFeel
+from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.geometry.linalg import limit_norm
 
 PATIENCE = 2.5  # longest time [s] from the first touch until the closing ends, even if some finger has not touched

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.control.controller import GraspController, check_holding
-from torchgrasp.control.grip import GripHold
+from torchgrasp.control.holding import GripHold
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.errors import BadArgument

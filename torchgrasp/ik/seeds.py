@@ -19,8 +19,7 @@ from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
 from torchgrasp.ik.ranking import lexical_order
 from torchgrasp.ik.refine import TIP_WEIGHT
-from torchgrasp.posture_model.encoding import check_compatible, encode
-from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, check_compatible, encode
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values import Contacts, IKSeeds
 

@@ -16,10 +16,9 @@ from torchgrasp.checks import ANY, check_tensor, checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.attempts import Attempts, assign
+from torchgrasp.ik.attempts import Attempts, assign, refine_by_cobyla
 from torchgrasp.ik.candidates import measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
-from torchgrasp.ik.cobyla import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import refine

@@ -14,8 +14,7 @@ from torchgrasp.base import FINGERTIPS
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import degenerate
-from torchgrasp.plan.closure import solve_closure_lp
-from torchgrasp.plan.wrench import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, wrenches
+from torchgrasp.plan.closure import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, solve_closure_lp, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, Contacts

@@ -17,8 +17,7 @@ from torchgrasp.checks import FINITE, Range, Seed, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import check_contacts, check_unit
-from torchgrasp.plan.closure import closed_exact, first_balance
-from torchgrasp.plan.wrench import Vectors, tangents
+from torchgrasp.plan.closure import Vectors, closed_exact, first_balance, tangents
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import combined_covariance, symmetric_root
 from torchgrasp.shape.values import surface_deviation

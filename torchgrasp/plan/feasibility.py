@@ -11,19 +11,19 @@ from torchgrasp.base import Batch
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.closure import solve_closure_lp
-from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, walls_of
-from torchgrasp.plan.solver import project
-from torchgrasp.plan.wrench import (
+from torchgrasp.plan.closure import (
     BALANCED,
     MIN_MARGIN,
     MIN_RANK_RATIO,
     Vectors,
     cone_edges,
     rank_ratio,
+    solve_closure_lp,
     tangents,
     wrenches,
 )
+from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, walls_of
+from torchgrasp.plan.solver import project
 from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts

@@ -25,9 +25,8 @@ from torch import Tensor
 from torchgrasp.checks import ANY, Positive, checked
 from torchgrasp.geometry.frames import skew
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
-from torchgrasp.plan.closure import solve_closure_lp
+from torchgrasp.plan.closure import Vectors, centre_and_radius, solve_closure_lp, wrenches
 from torchgrasp.plan.problem import contact_pairs, pull_signs
-from torchgrasp.plan.wrench import Vectors, centre_and_radius, wrenches
 
 DIRECTIONS, NEIGHBOURS, REFINEMENTS, SHRINK = 1024, 128, 12, 0.55
 """The search tries all directions, then neighbours of the best in rounds, each of a smaller radius by `SHRINK`."""

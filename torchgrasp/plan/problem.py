@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, map_tensors
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.plan.wrench import Vectors
+from torchgrasp.plan.closure import Vectors
 from torchgrasp.shape.values import MeanJet, SurfaceJet
 from torchgrasp.specs import ContactSpec
 

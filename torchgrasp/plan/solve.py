@@ -11,11 +11,11 @@ from torch import Tensor
 from torchgrasp.base import join, pick, put
 from torchgrasp.checks import Count, Positive, Seed, checked
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.plan.closure import Vectors
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.problem import ContactProblem, Shape
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, given_starts, settle_flatness
-from torchgrasp.plan.wrench import Vectors
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import ContactPlan

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchgrasp.base import Batch
 from torchgrasp.geometry.linalg import limit_norm
 from torchgrasp.geometry.optim import Damping, Linearisation, Problem, Steps, Verdict, levenberg_marquardt
+from torchgrasp.plan.closure import Vectors
 from torchgrasp.plan.problem import (
     ContactProblem,
     Shape,
@@ -24,7 +25,6 @@ from torchgrasp.plan.problem import (
     triple_mean_jet,
     with_variance,
 )
-from torchgrasp.plan.wrench import Vectors
 from torchgrasp.shape.surface import newton_step
 
 LONGEST_STEP = 0.3

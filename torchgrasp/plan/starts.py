@@ -10,11 +10,10 @@ from torch import Tensor
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.closure import closed_exact
+from torchgrasp.plan.closure import Vectors, closed_exact
 from torchgrasp.plan.feasibility import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of, walls_of
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.wrench import Vectors
 from torchgrasp.specs import FLAT_RADII, ContactSpec
 
 CANDIDATE_TRIPLES = 350

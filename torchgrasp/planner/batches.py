@@ -9,8 +9,7 @@ import torch
 
 from torchgrasp.base import count_status, join
 from torchgrasp.errors import Status
-from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_contact_first
-from torchgrasp.ik.cobyla import solve_as_paper
+from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_as_paper, solve_contact_first
 from torchgrasp.ik.joint import solve_sliding, try_best_seeds
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.ik.ranking import (

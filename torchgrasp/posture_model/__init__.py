@@ -1,6 +1,6 @@
 """The learned posture model: a Gaussian mixture over the joints of a hand and the codes of its fingertips (Sec. 4)."""
 
-from torchgrasp.posture_model.encoding import encode
+from torchgrasp.posture_model.mixture import encode
 from torchgrasp.posture_model.sample import HandSamples, SampleSpec, sample_configurations
 from torchgrasp.posture_model.dataset import SampleFolder, load_samples, write_samples
 from torchgrasp.posture_model.em import Components, Progress

@@ -20,7 +20,7 @@ from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import fibonacci_sphere, unit
 from torchgrasp.hand.hand import Hand
-from torchgrasp.posture_model.encoding import describe_compatibility, encode_fingertips
+from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
 from torchgrasp.specs import ContactSpec
 
 ROLL = math.radians(25)

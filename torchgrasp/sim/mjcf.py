@@ -13,8 +13,7 @@ import numpy as np
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf, read_urdf
-from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides, pair_masks
-from torchgrasp.sim.scene_spec import ARMATURE, Body, SceneSpec
+from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, mount_slides, pair_masks
 
 OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
 """Names of the object (its body and its free joint), of the table, and of the neighbours by number."""

@@ -7,9 +7,8 @@ import numpy as np
 from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.sim.mjcf import NEIGHBOUR, OBJECT, scene_mjcf
-from torchgrasp.sim.mount import MOUNT_DRIVE, mount_slides
 from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, StepContacts
-from torchgrasp.sim.scene_spec import SceneSpec
+from torchgrasp.sim.scene_spec import MOUNT_DRIVE, SceneSpec, mount_slides
 
 
 class MujocoScene(Scene):

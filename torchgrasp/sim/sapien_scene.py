@@ -18,9 +18,21 @@ import numpy as np
 
 from torchgrasp.errors import MissingExtra
 from torchgrasp.files import temporary_folder, write_file
-from torchgrasp.sim.mount import MOUNT_DRIVE, WRIST_JOINT, mount_slides, mounted_urdf, pair_masks
 from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, StepContacts
-from torchgrasp.sim.scene_spec import APPROACH_JOINT, ARMATURE, LIFT_JOINT, SHIFT_JOINTS, TABLE, Body, SceneSpec
+from torchgrasp.sim.scene_spec import (
+    APPROACH_JOINT,
+    ARMATURE,
+    LIFT_JOINT,
+    MOUNT_DRIVE,
+    SHIFT_JOINTS,
+    TABLE,
+    WRIST_JOINT,
+    Body,
+    SceneSpec,
+    mount_slides,
+    mounted_urdf,
+    pair_masks,
+)
 
 
 class Built(NamedTuple):

@@ -1,18 +1,23 @@
 """Parameters of a simulated scene: table, object, neighbours, and a hand on a mount."""
 
 import dataclasses
-from collections.abc import Sequence
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from torchgrasp.checks import checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
+from torchgrasp.hand.urdf import read_urdf
 
 if TYPE_CHECKING:
     import trimesh
+
 
 ARMATURE = 1e-3  # inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it
 
@@ -128,3 +133,115 @@ class SceneSpec:
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
             raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
+
+
+MOUNT_DRIVE = Actuator(effort=1e4, velocity=10.0, kp=1e4, kd=1e3)
+"""Motor of a slide: force [N], speed [m/s], stiffness [N/m], damping [N s/m]."""
+
+WRIST_JOINT = "torchgrasp_wrist"  # name of the fixed joint between mount and hand
+
+
+class Slide(NamedTuple):
+    """A prismatic joint of the mount: name, axis in the world, limits, start [m]."""
+
+    name: str
+    axis: tuple[float, float, float]
+    lower: float
+    upper: float
+    start: float
+
+
+def mount_slides(spec: SceneSpec) -> list[Slide]:
+    """Return the joints of the mount, from the world to the hand."""
+    slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, spec.travel + 0.05, 0.0)]
+    length = float(np.linalg.norm(spec.approach))
+    if length > 0:
+        x, y, z = spec.approach
+        axis = (x / length, y / length, z / length)
+        slides.append(Slide(APPROACH_JOINT, axis, -length - 0.01, 0.01, -length))
+    if spec.yields > 0:
+        most, axes = spec.yields + 0.01, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        slides += [Slide(name, axis, -most, most, 0.0) for name, axis in zip(SHIFT_JOINTS, axes, strict=True)]
+    return slides
+
+
+def mounted_urdf(spec: SceneSpec) -> str:
+    """Return the URDF of the hand on its mount.
+
+    It has no `<visual>`, which needs a render device, and no `<mimic>`: SAPIEN's mimic joints transmit wrong forces, so
+    coupled joints get their own targets.
+
+    Raises:
+        HandFileError: the file is not a valid URDF (`read_urdf`).
+    """
+    urdf = read_urdf(spec.urdf_path)
+    robot = ET.fromstring(urdf.xml)
+    for joint in robot.iter("joint"):
+        for mimic in joint.findall("mimic"):
+            joint.remove(mimic)
+    roll, pitch, yaw = euler_from_rotation(spec.world_from_hand[:3, :3])
+    x, y, z = spec.world_from_hand[:3, 3]
+    mount, parent = ['<link name="torchgrasp_world"/>'], "torchgrasp_world"
+    for slide in mount_slides(spec):
+        child = f"{slide.name}_link"
+        mount.append(
+            f"""<link name="{child}"><inertial><origin xyz="0 0 0"/><mass value="1"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+  <joint name="{slide.name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>
+    <axis xyz="{" ".join(f"{x:.12g}" for x in slide.axis)}"/>
+    <limit lower="{slide.lower:.9g}" upper="{slide.upper:.9g}" effort="1000" velocity="10"/></joint>"""
+        )
+        parent = child
+    mount.append(
+        f"""<joint name="{WRIST_JOINT}" type="fixed"><parent link="{parent}"/><child link={quoteattr(urdf.root)}/>
+    <origin xyz="{x:.12g} {y:.12g} {z:.12g}" rpy="{roll:.12g} {pitch:.12g} {yaw:.12g}"/></joint>"""
+    )
+    robot[:0] = list(ET.fromstring(f"<mount>{''.join(mount)}</mount>"))
+    return ET.tostring(robot, encoding="unicode")
+
+
+def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
+    """Return a URDF's roll, pitch, yaw [rad]: R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    At a pitch of 90 degrees only yaw - roll is determined; roll is 0 there.
+    """
+    sine = -float(rotation[2, 0])
+    cosine = math.hypot(float(rotation[0, 0]), float(rotation[1, 0]))
+    pitch = math.atan2(sine, cosine)
+    if cosine < 1e-9:
+        return 0.0, pitch, math.atan2(-float(rotation[0, 1]), float(rotation[1, 1]))
+    roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
+    return roll + 0.0, pitch + 0.0, math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
+
+
+def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[int, int]]:
+    """Return for each link of the pairs its own bits, and the bits that it collides with.
+
+    Two links collide if the bits of one share a bit with those that the other collides with, as in PhysX and MuJoCo.
+    Only one link of each pair needs a bit of its own.
+
+    Args:
+        pairs: names of links.
+        first: first free bit.
+
+    Raises:
+        HandFileError: the pairs need more bits than the masks have.
+    """
+    bits = 31  # MuJoCo's masks are signed numbers of 32 bits
+    left = [tuple(pair) for pair in pairs]
+    kinds, hits = (dict.fromkeys((name for pair in left for name in pair), 0) for _ in range(2))
+    for bit in range(first, bits):
+        if not left:
+            break
+        names = [name for pair in left for name in pair]
+        owner = max(kinds, key=names.count)  # the first of equals
+        kinds[owner] = 1 << bit
+        for one, two in left:
+            if owner in (one, two):
+                hits[two if one == owner else one] |= 1 << bit
+        left = [pair for pair in left if owner not in pair]
+    if left:
+        raise HandFileError(
+            "self_collision", f"{len(left)} pairs too many", f"pairs that {bits - first} bits distinguish"
+        )
+    return {name: (kinds[name], hits[name]) for name in kinds}

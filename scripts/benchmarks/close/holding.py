@@ -25,7 +25,7 @@ from benchmarks.close.household import HOUSEHOLD, plan_view, read_solid, table_s
 from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import household_mass
 from torchgrasp.closure import ClosureResult
-from torchgrasp.control.observation import joint_jacobian
+from torchgrasp.control.tactile import joint_jacobian
 from torchgrasp.data import list_views, read_mass
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import close_hand

@@ -29,12 +29,11 @@ from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import refine
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
-from torchgrasp.posture_model.em import Shard, expectation, maximisation
-from torchgrasp.posture_model.kmeans import start_components
+from torchgrasp.posture_model.em import Shard, expectation, maximisation, start_components
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.shape.values import Normalisation, on_surface
-from torchgrasp.testing.hands import random_joints
+from torchgrasp.testing import random_joints
 from torchgrasp.values import PointCloud
 
 SPEC = ContactSpec(table=0.0)

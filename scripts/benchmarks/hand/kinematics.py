@@ -25,7 +25,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import chain_from_urdf
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.posture_model.dataset import load_samples
-from torchgrasp.testing.hands import random_joints, reference_poses
+from torchgrasp.testing import random_joints, reference_poses
 
 HANDS = ("allegro", "barrett")
 POSTURES = 1000

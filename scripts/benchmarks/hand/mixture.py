@@ -19,11 +19,16 @@ from benchmarks.common import Options, Row, bench, least_seconds, peak_mib
 from benchmarks.hand.query import touched
 from torchgrasp import Hand, Status, list_objects, load_hand, load_mixture, load_object, plan_grasps
 from torchgrasp.ik.seeds import query_mixture
-from torchgrasp.posture_model.em import Progress, Shard, expectation, expectation_maximisation, maximisation
-from torchgrasp.posture_model.encoding import encode_fingertips
+from torchgrasp.posture_model.em import (
+    Progress,
+    Shard,
+    expectation,
+    expectation_maximisation,
+    maximisation,
+    start_components,
+)
 from torchgrasp.posture_model.fit import fit_mixture
-from torchgrasp.posture_model.kmeans import start_components
-from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, encode_fingertips
 from torchgrasp.posture_model.sample import HandSamples, Sampling, sample_configurations
 from torchgrasp.posture_model.score import MixtureScore, evaluate_mixture
 

@@ -18,7 +18,7 @@ from benchmarks.common import Options, Row, bench
 from torchgrasp import Contacts, load_hand, load_mixture
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik import cobyla
+from torchgrasp.ik import attempts
 from torchgrasp.ik.attempts import assign
 from torchgrasp.ik.candidates import TIP_TOLERANCE
 from torchgrasp.ik.clearance import CollisionWorld
@@ -106,18 +106,18 @@ def _cobyla_row(hand: Hand, mixture: GraspMixture, contacts: Contacts, ours: IKS
     seeds, asked = timed(lambda: query_mixture(hand, contacts, mixture, n_seeds=2))
     seeds = seeds[rank_in_group(seeds.row) == 0]
     taken, start = assign(contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
-    spent, evaluate = [0.0], cobyla.CobylaRun.evaluate
+    spent, evaluate = [0.0], attempts.CobylaRun.evaluate
 
-    def counted(self: cobyla.CobylaRun, x: np.ndarray) -> tuple[float, np.ndarray]:
+    def counted(self: attempts.CobylaRun, x: np.ndarray) -> tuple[float, np.ndarray]:
         values, used = timed(lambda: evaluate(self, x))
         spent[0] += used
         return values
 
-    cobyla.CobylaRun.evaluate = counted
+    attempts.CobylaRun.evaluate = counted
     try:
-        refined, used = timed(lambda: cobyla.refine_by_cobyla(hand, start, taken, CollisionWorld()))
+        refined, used = timed(lambda: attempts.refine_by_cobyla(hand, start, taken, CollisionWorld()))
     finally:
-        cobyla.CobylaRun.evaluate = evaluate
+        attempts.CobylaRun.evaluate = evaluate
     points = SpatialJacobian.at(hand, refined).points(hand.tips.index, hand.tips.contact)
     error = 1e3 * torch.linalg.vector_norm(points - taken.points, dim=-1).amax(1)
     clear = hand.self_clearance(refined.joints) >= 0

@@ -11,8 +11,7 @@ from benchmarks.common import Options, Row, bench, least_seconds
 from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify, solve_by_highs
-from torchgrasp.plan.closure import solve_closure_lp
-from torchgrasp.plan.wrench import MIN_MARGIN, wrenches
+from torchgrasp.plan.closure import MIN_MARGIN, solve_closure_lp, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 

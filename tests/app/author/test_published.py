@@ -12,8 +12,7 @@ from torchgrasp.app.author.draft import Wish, new_hand
 from torchgrasp.app.author.fit_shapes import fit_shapes
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.urdf import read_published, read_urdf
-from torchgrasp.testing import check_hand
-from torchgrasp.testing.hands import random_joints
+from torchgrasp.testing import check_hand, random_joints
 
 END = "</robot>"
 

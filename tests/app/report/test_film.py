@@ -11,7 +11,7 @@ from PIL import Image
 
 from torchgrasp.app.report.canvas import ALARM, rgb
 from torchgrasp.app.report.film import STILL, TITLE, WIDTH, _list_plots, describe_film, draw_film
-from torchgrasp.app.report.moments import explain_loss, find_loss, moments_of, moved_in_hand
+from torchgrasp.app.report.run import explain_loss, find_loss, moments_of, moved_in_hand
 from torchgrasp.closure import ClosingTrace
 from torchgrasp.errors import Status
 

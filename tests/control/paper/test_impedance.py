@@ -5,7 +5,7 @@ import torch
 
 from tests.point_fingers import PERIOD, TOUCHING, observation, real, reference
 from torchgrasp.control.holding import RAMP, held_forces
-from torchgrasp.control.paper.impedance import (
+from torchgrasp.control.paper.closings import (
     ROTATION_STIFFNESS,
     TRANSLATION_STIFFNESS,
     Impedance,

@@ -17,7 +17,7 @@ from torchgrasp.control.paper.stability import (
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.hand.load import load_hand
-from torchgrasp.posture_model.encoding import describe_compatibility, encode_fingertips
+from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
 
 
 def states(count: int, strength: float, seed: int) -> torch.Tensor:

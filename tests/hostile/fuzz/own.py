@@ -17,7 +17,7 @@ from torchgrasp.export import format_grasps, format_moveit
 from torchgrasp.hand import hand_of
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.posture_model import GraspMixture, HandSamples, SampleSpec, load_samples, write_samples
-from torchgrasp.posture_model.encoding import CODE_NAMES
+from torchgrasp.posture_model.mixture import CODE_NAMES
 from torchgrasp.sim.convex_parts import _load, _save  # pyright: ignore[reportPrivateUsage]
 from torchgrasp.values import Certificate, Contacts, Grasps
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchgrasp.app.author.repair import place, pose_of
-from torchgrasp.files.meshes import load_triangles
+from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.safe_xml import read_bounded
 from torchgrasp.hand.urdf import Shape, Urdf

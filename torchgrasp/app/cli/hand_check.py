@@ -18,8 +18,7 @@ from torchgrasp.hand.load import find_hand
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.problem import finger_sets
 from torchgrasp.posture_model.sample import can_close
-from torchgrasp.testing import check_hand
-from torchgrasp.testing.hands import find_faults, most_met, random_joints
+from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
 FREE, FACING, CLOSING = 0.2, 0.02, 0.001
 """Least shares of random postures that are free, face a pad to the others, and can hold an object; three fingers."""

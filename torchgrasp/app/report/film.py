@@ -17,7 +17,7 @@ from torchgrasp.app.report.canvas import (
     encode_png,
     frame_camera,
 )
-from torchgrasp.app.report.moments import LOST, Moment, explain_loss, first_touches, moments_of, moved_in_hand, tick_of
+from torchgrasp.app.report.run import LOST, Moment, explain_loss, first_touches, moments_of, moved_in_hand, tick_of
 from torchgrasp.app.report.solids import link_poses, solids_of_links
 from torchgrasp.app.report.stills import to_array
 from torchgrasp.closure import ClosureResult

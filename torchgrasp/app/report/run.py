@@ -1,17 +1,20 @@
-"""A run from cloud to grasps and closing, and its verdict in words."""
+"""A run from cloud to grasps and closing, the moments of the closing, and its verdict in words."""
 
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from torchgrasp.base import count_status
 from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
 from torchgrasp.errors import Status
-from torchgrasp.geometry.frames import inverse
+from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE, SLIP_ANGLE, SLIP_DISTANCE
+from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.explain import Explanation
@@ -139,3 +142,122 @@ def _too_low(run: Run) -> str:
         return ""
     height, needed = float(spec.plane.height(run.surface.vertices).max()), spec.least_height
     return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm" * (height < needed)
+
+
+LOST = "lost"  # name of the moment at which an object was lost
+
+
+class Moment(NamedTuple):
+    """A tick and the name of what happened then."""
+
+    tick: int
+    name: str
+
+
+def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
+    """Return which fingertips touch the object."""
+    return closure.trace.normals.isfinite().all(-1)
+
+
+def first_touches(closure: ClosureResult) -> list[int]:
+    """Return the tick of each finger's first touch, in the order of `contact_order`."""
+    touched = touching(closure)
+    return [int(touched[:, finger].int().argmax()) for finger in closure.contact_order]
+
+
+def moved_in_hand(
+    closure: ClosureResult, centre: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
+    """Return how far the centre of mass moved [m] and turned [rad] in the hand since all fingers pressed."""
+    hand_from_object = inverse(closure.hand_pose.double()) @ closure.object_pose.double()
+    start = hand_from_object[tick_of(closure, 2)]
+    centres = apply(hand_from_object, centre.double().expand(len(hand_from_object), 1, 3))[:, 0]
+    turn = rotation_angle(start[:3, :3].T @ hand_from_object[:, :3, :3])
+    return torch.linalg.vector_norm(centres - apply(start, centre.double()[None]), dim=-1), turn
+
+
+def tick_of(closure: ClosureResult, phase: int) -> int:
+    """Return the tick at which a phase ended, or the last tick if the phase never ended."""
+    end = closure.phases[phase]
+    return int((closure.time - end).abs().argmin()) if bool(end.isfinite()) else len(closure.time) - 1
+
+
+def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
+    """Return the tick at which the object was lost; None if it was held.
+
+    EJECTED: the first tick at which the object is too far from its place. TOO_HEAVY: the highest tick. Otherwise the
+    earlier of two ticks: from then on fewer than two fingertips touch, or the object has slipped too far in the hand.
+    """
+    if closure.held:
+        return None
+    last, pressed = len(closure.time) - 1, tick_of(closure, 2)
+    if closure.status in (Status.START_OVERLAP, Status.UNSTABLE):
+        return last
+    if closure.status is Status.TOO_HEAVY:
+        return int(closure.hand_pose[:, 2, 3].argmax())
+    if closure.status is Status.EJECTED:
+        world = apply(closure.object_pose.double(), centre.double().expand(len(closure.time), 1, 3))[:, 0]
+        away = torch.linalg.vector_norm(world - world[0], dim=-1) > PUSHED_DISTANCE
+        return int(away.int().argmax()) if bool(away.any()) else last
+    distance, angle = moved_in_hand(closure, centre)
+    gone = (distance > SLIP_DISTANCE) | (angle > SLIP_ANGLE)
+    gone[: pressed + 1] = False
+    held = torch.nonzero(touching(closure).sum(1) >= 2)
+    let_go = min(int(held[-1]) + 1, last) if len(held) else pressed
+    return min(let_go, int(gone.int().argmax()) if bool(gone.any()) else last)
+
+
+def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> str:
+    """Say when the object was lost, in which phase, and which finger failed first; "" if it was held."""
+    tick = find_loss(closure, centre)
+    if tick is None:
+        return ""
+    pressed, rises = tick_of(closure, 2), bool(closure.phases[2].isfinite())
+    time, start = float(closure.time[tick]), float(closure.time[pressed])
+    phase = "closed" if not rises or tick <= pressed else "rose" if time < start + LIFT_TIME else "held it"
+    seen = closure.status not in (Status.START_OVERLAP, Status.UNSTABLE, Status.TOO_HEAVY)
+    reason = (seen and (_never_touched(closure, fingers) or _first_to_go(closure, tick, fingers))) or ""
+    lost = "Put down from" if closure.status is Status.TOO_HEAVY else "Lost at"
+    return f"{lost} {time:.2f} s, while the hand {phase}: {reason or closure.status.sentence}."
+
+
+def _never_touched(closure: ClosureResult, fingers: tuple[str, ...]) -> str:
+    """Name the fingers that never touched."""
+    never = [name for finger, name in enumerate(fingers) if finger not in closure.contact_order]
+    return f"{' and '.join(never)} never touched the object" if never else ""
+
+
+def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) -> str:
+    """Name the finger that was the first to slide or let go for good before a tick."""
+    touched, sliding = touching(closure)[: tick + 1], closure.trace.sliding[: tick + 1].nan_to_num(0.0)
+    firm = touched & (sliding < 0.01)  # [m/s]: fingertips that stick creep more slowly
+    # The first tick after which each finger was never firm again; the finger with the earliest gave way first.
+    since = [int(torch.nonzero(column)[-1]) + 1 if bool(column.any()) else 0 for column in firm.T]
+    finger = min(range(len(since)), key=since.__getitem__)
+    begin = since[finger]
+    if begin > tick:
+        return ""
+    name, time = fingers[finger], float(closure.time[begin])
+    if not bool(touched[begin, finger]):
+        return f"{name} let go first, at {time:.2f} s"
+    force, normal = closure.trace.forces[begin, finger], closure.trace.normals[begin, finger]
+    press = float((force @ normal).abs())
+    across = float(torch.linalg.vector_norm(force - (force @ normal) * normal))
+    return f"{name} slid first, from {time:.2f} s on, under {across:.1f} N across at {press:.1f} N of normal force"
+
+
+def moments_of(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> list[Moment]:
+    """Return the moments that a film of a closing shows, in order."""
+    found = [Moment(tick_of(closure, 0), "open hand")]
+    if closure.contact_order:
+        found.append(Moment(first_touches(closure)[0], f"{fingers[closure.contact_order[0]]} touches first"))
+    all_touch = len(closure.contact_order) == len(fingers)
+    ends = ((1, "all touch" if all_touch else "the closing ends"), (2, "pressed"))
+    found += [Moment(tick_of(closure, k), name) for k, name in ends if bool(closure.phases[k].isfinite())]
+    lost = find_loss(closure, centre)
+    if lost is not None:
+        found.append(Moment(lost, LOST))
+    found.append(Moment(len(closure.time) - 1, "the end"))
+    found.sort(key=lambda moment: (moment.tick, moment.name == LOST))  # of two at one tick, the later is kept
+    later = [*(moment.tick for moment in found[1:]), len(closure.time)]
+    return [m for m, tick in zip(found, later, strict=True) if m.tick < tick]

@@ -1,13 +1,20 @@
-"""Closings to compare with: the paper's control law (Eqs. 25-28), its position controller, and the open loop."""
+"""Closings to compare with: the paper's control law (Eqs. 25-28) and position control, open loop, impedance."""
+
+import math
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.law import POSITION_RATE, blend, joint_step, tip_velocity
-from torchgrasp.control.observation import STILL, Observation
+from torchgrasp.checks import checked
+from torchgrasp.control.forces import actuated_stiffness
+from torchgrasp.control.holding import RAMP, held_forces, regulate
+from torchgrasp.control.law import POSITION_RATE, blend, damped_inverse, joint_step, tip_velocity
+from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.reference import ClosingReference, next_target
-from torchgrasp.control.tactile import NOISE
+from torchgrasp.control.tactile import NOISE, STILL, Observation, low_pass
+from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
+from torchgrasp.plan.forces import grasp_map, internal_forces
 
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
 
@@ -136,3 +143,119 @@ class OpenLoopClosing:
         self.done = self.time >= 2 * POSE_TIME - 0.5 * period
         first = min(int(progress), 1)
         return torch.lerp(self.poses[first], self.poses[first + 1], progress - first)
+
+
+TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0  # stiffness of the virtual frame [N/m, N m/rad]
+
+GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the triangle of fingertips
+
+
+def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:
+    """Return force [N] and torque [N m] that restore the virtual frame to its pose at rest.
+
+    The torque is proportional to the sine of the rotation error.
+    """
+    axes, desired = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
+    error = 0.5 * torch.linalg.cross(axes, desired).sum(-2)
+    force = TRANSLATION_STIFFNESS * (rest[..., :3, 3] - hand_from_vf[..., :3, 3])
+    return torch.cat([force, ROTATION_STIFFNESS * error], -1)
+
+
+def shared_forces(
+    points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the smallest forces that exert a wrench, scaled so that none exceeds `most` [N]."""
+    forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
+    largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
+    return forces * (most / torch.maximum(largest, most))[..., None, None]
+
+
+def spring_forces(
+    points: Float[Tensor, "*b 3 3"], lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the balanced forces of springs [N/m] along the sides of a triangle, at rest at `lengths` [m]."""
+    return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
+
+
+def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Return the lengths of the sides (0, 1), (1, 2) and (2, 0) of a triangle [m]."""
+    return torch.linalg.vector_norm(points.roll(-1, dims=-2) - points, dim=-1)
+
+
+class Impedance:
+    """Hold the object as a spring in the hand, by joint targets q + J^T f / kp.
+
+    At rest the forces are the desired ones, balanced at the sensed contacts. Null-space motions of the joints are
+    suppressed. A grasp that the stability model judges unstable becomes firmer and stiffer, and stays so.
+
+    Args:
+        reference, observation, start: as for `ForceHold`.
+        springs: stiffness [N/m] along the `side_lengths`; None: `GRASP_STIFFNESS`.
+        stability: model of the hand's stable grasps; None: the grasp does not adapt.
+    """
+
+    def __init__(
+        self,
+        reference: ClosingReference,
+        observation: Observation,
+        start: Float[Tensor, " j"],
+        springs: Float[Tensor, "3"] | None = None,
+        stability: StabilityModel | None = None,
+    ) -> None:
+        self.reference, self.stability, self.coupling = reference, stability, reference.hand.actuated.coupling
+        self.springs = torch.full((3,), GRASP_STIFFNESS).to(observation.tips) if springs is None else springs
+        self.stiffness = actuated_stiffness(self.coupling, reference.kp)
+        forces, self.strength = held_forces(reference, observation)
+        self.frame = rigid(torch.eye(3).to(observation.tips), observation.tips.mean(0))
+        self.rest, self.lengths = self._frame(observation.tips), side_lengths(observation.tips)
+        self.desired = forces @ self.rest[:3, :3]  # in the virtual frame
+        self.posture = self._actuated(observation.joints)
+        self.lead = self._actuated(start) - self.posture
+        self.factor, self.raised, self.time = 1.0, 1.0, 0.0
+        self.reading = observation.tactile.reading
+
+    def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
+        """Return the targets of all joints for the next tick."""
+        self.time += period
+        share = min(self.time / RAMP, 1.0)
+        self.reading = self.reading + low_pass(2.0, period) * (observation.tactile.reading - self.reading)
+        if share == 1.0:
+            self.factor = regulate(self.factor, observation, self.raised * self.strength, period)
+            self._adapt(observation, period)
+        posture = self._actuated(observation.joints)
+        jacobian = (observation.jacobian @ self.coupling).flatten(0, 1)
+        lead = jacobian.T @ self.forces(observation.tips).flatten() / self.stiffness
+        drift = self.posture - posture
+        drift = drift - damped_inverse(jacobian) @ (jacobian @ drift)
+        return self.reference.expand(posture + drift + self.lead + share * (lead - self.lead))
+
+    def _adapt(self, observation: Observation, period: float) -> None:
+        """Make an unstable grasp firmer, and as stiff as stable grasps of these lengths."""
+        if self.stability is None or self.time < RAMP + 0.3:  # the filtered readings must have followed the forces
+            return
+        state = state_of(self.springs, lengths_of(observation.tips), self.reading)
+        if float(self.stability.log_odds(state)) > math.log(3):
+            return
+        preferred, share = self.stability.preferred_forces(observation.tips), min(8.0 * period, 1.0)
+        self.raised += share * (2.0 - self.raised)
+        self.springs = self.springs * (preferred.springs / self.springs) ** share
+
+    @checked
+    def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+        """Return the fingertips' forces on the object [N]."""
+        frame = self._frame(tips)
+        desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
+        most = torch.linalg.vector_norm(desired, dim=-1).amax()  # the wrench lifts no finger
+        springs = spring_forces(tips, self.lengths, self.springs)
+        return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
+
+    def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
+        """Return the virtual frame, or the last frame if the tips are on a line."""
+        if not bool(degenerate(tips)):
+            self.frame = virtual_frame(tips)
+        return self.frame
+
+    def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
+        """Return the actuated joints nearest to all joints, weighted by stiffness."""
+        weighted = self.coupling * self.reference.kp[:, None]
+        return weighted.T @ (joints - self.reference.hand.actuated.offset) / self.stiffness

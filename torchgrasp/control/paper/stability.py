@@ -20,8 +20,8 @@ from torchgrasp.checks import LEAST, Positive, Range, checked
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.hand.hand import Hand
-from torchgrasp.posture_model.encoding import check_compatible
 from torchgrasp.posture_model.gaussian import GaussianMixture
+from torchgrasp.posture_model.mixture import check_compatible
 
 STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "logL3"), ("logF1", "logF2", "logF3")
 """Logarithms of spring stiffness [N/m], of the tips' distances from their virtual frame [m], of normal forces [N]."""

@@ -1,4 +1,4 @@
-"""The check of a hand: planning and closing rely on these rules and laws."""
+"""A check of a hand of your own: planning and closing rely on these rules of its files and laws of its kinematics."""
 
 import io
 from collections.abc import Iterator
@@ -17,6 +17,8 @@ from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
 from torchgrasp.hand.kinematics import chain_from_urdf
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
+
+__all__ = ["BrokenLaw", "check_hand"]
 
 FK_POSTURES = 50  # number of random postures in which kinematics are compared
 FK_TOLERANCE = 1e-8  # largest difference [m, and entries of rotations] from the poses of other libraries
