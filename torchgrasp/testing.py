@@ -22,8 +22,6 @@ __all__ = ["BrokenLaw", "check_hand"]
 
 FK_POSTURES = 50  # number of random postures in which kinematics are compared
 FK_TOLERANCE = 1e-8  # largest difference [m, and entries of rotations] from the poses of other libraries
-STEP, JACOBIAN_TOLERANCE = 1e-6, 1e-6
-"""Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian."""
 
 
 @checked
@@ -64,10 +62,12 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
     """Compare the Jacobian with central differences, and rows of a batch with each alone."""
-    steps = STEP * torch.eye(hand.dof, dtype=torch.float64)
+    # Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian
+    step, allowed = 1e-6, 1e-6
+    steps = step * torch.eye(hand.dof, dtype=torch.float64)
     after, before = (hand.fingertips(joints[:, None] + sign * steps)[0] for sign in (1, -1))
-    error = ((after - before) / (2 * STEP) - hand.jacobian(joints).movedim(-1, 1)).abs().amax((0, 2, 3))
-    if not float(error.max()) < JACOBIAN_TOLERANCE:
+    error = ((after - before) / (2 * step) - hand.jacobian(joints).movedim(-1, 1)).abs().amax((0, 2, 3))
+    if not float(error.max()) < allowed:
         found = f"the column of {hand.joint_names[int(error.argmax())]} off by {float(error.max()):.3g}"
         raise BrokenLaw("jacobian", found, "that of central differences")
     points, _ = hand.fingertips(joints)

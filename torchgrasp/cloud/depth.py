@@ -19,7 +19,6 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.limits import CLOUD_BYTES
 from torchgrasp.values import PointCloud
 
-MAX_SHIFT = 0.15  # largest distance of the principal point from the image's middle, in sides of the image
 MAX_DEPTH = 50.0  # largest median depth [m]; no depth camera sees so far
 
 
@@ -119,6 +118,7 @@ def _read_intrinsics(
     intrinsics: Tensor | np.ndarray | Sequence[float | int], size: Sequence[int]
 ) -> Float[Tensor, "3 3"]:
     """Return the matrix of intrinsics [px] of an image (h, w), or refuse it."""
+    max_shift = 0.15  # largest distance of the principal point from the image's middle, in sides of the image
     k = _as_tensor("intrinsics", intrinsics).double()
     if k.shape == (4,):
         fx, fy, cx, cy = k.tolist()
@@ -130,7 +130,7 @@ def _read_intrinsics(
         raise BadArgument("intrinsics", k.tolist(), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
     height, width = size
     shift = [abs(float(k[0, 2]) / width - 0.5), abs(float(k[1, 2]) / height - 0.5)]
-    if max(shift) > MAX_SHIFT:
+    if max(shift) > max_shift:
         found = f"a principal point ({float(k[0, 2]):.1f}, {float(k[1, 2]):.1f}) px in an image of {width} x {height}"
         raise BadArgument(
             "intrinsics", found, "a principal point near the image's middle, from intrinsics of the same resolution"

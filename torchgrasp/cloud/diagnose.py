@@ -18,8 +18,6 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
-MEASURED = 50_000  # most points at which spacing, noise and outliers are measured
-
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -67,12 +65,13 @@ def diagnose_cloud(
     >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
     0
     """
+    most = 50_000  # most points at which spacing, noise and outliers are measured
     vertical = torch.tensor([0.0, 0.0, 1.0]) if up is None else check_tensor("up", up, (3,)).cpu()
     cloud, table = cloud.to("cpu"), None if table is None else table.to("cpu")
     if not bool(vertical.any()):
         raise BadArgument("up", "a vector of length zero", "the direction that points up")
     whole = remove_duplicates(cloud)
-    points, rows = whole.points.double(), draw_rows(len(whole), MEASURED)
+    points, rows = whole.points.double(), draw_rows(len(whole), most)
     distance, _ = nearest(points, 9, rows)  # the point itself and a raster's eight neighbours
     area = math.pi * distance[:, -1] ** 2  # of the disc that holds the neighbours
     some = whole.select(rows)

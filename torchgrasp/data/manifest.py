@@ -30,10 +30,7 @@ if TYPE_CHECKING:
 WHOLE = "whole"  # name of the view that shows an object from all sides, with normals: `full_normals.ply`
 MOST_SCALE, MOST_METRES, MOST_MASS = 1e4, 1e4, 1e4
 """Largest scale, its inverse being the least, largest coordinate [m] of a camera, and largest mass [kg]."""
-LONGEST_NAME = 100  # most letters of a name: file names have 255 bytes
 MESHES = (".ply", ".stl", ".obj", ".off")  # suffixes of the meshes that `write_objects` takes from a folder
-ELEVATION, DISTANCE = (25.0, 45.0), 0.5
-"""Of a rendered view: angle above the horizontal [deg], uniform, and distance [m], as of a camera on a robot's arm."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,6 +138,8 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
     >>> write_objects(folder, folder / "objects", views=1)
     ['carton']
     """
+    # Of a rendered view: angle above the horizontal [deg], uniform, and distance [m], as of a camera on a robot's arm
+    elevations, distance = (25.0, 45.0), 0.5
     files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in MESHES)
     names = [path.stem for path in files]
     if not files or len(set(names)) != len(names):
@@ -156,8 +155,8 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
         poses = dict[str, object]()
         for k in range(views):
             first, second = torch.rand(2, generator=generator).tolist()
-            elevation = ELEVATION[0] + (ELEVATION[1] - ELEVATION[0]) * second
-            camera = look_at(360.0 * first, elevation, DISTANCE, mesh)
+            elevation = elevations[0] + (elevations[1] - elevations[0]) * second
+            camera = look_at(360.0 * first, elevation, distance, mesh)
             noise = int(torch.randint(2**31, (1,), generator=generator))
             save_cloud(partial_view(mesh, camera, seed=noise), Path(out) / path.stem / f"view{k}_noisy.ply")
             poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
@@ -168,10 +167,11 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
 
 def check_name(field: Field, name: str) -> None:
     """Refuse a name that is more than one part of a path, or that a terminal would not print."""
+    longest_name = 100  # most letters of a name: file names have 255 bytes
     plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
-    if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= LONGEST_NAME:
-        allowed = f"a printable name of 1 to {LONGEST_NAME} bytes without / \\ : or a dot or space at its ends"
-        raise field.refuse(f"{field.path}: the name {name[:LONGEST_NAME]!r}", allowed)
+    if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= longest_name:
+        allowed = f"a printable name of 1 to {longest_name} bytes without / \\ : or a dot or space at its ends"
+        raise field.refuse(f"{field.path}: the name {name[:longest_name]!r}", allowed)
 
 
 @checked

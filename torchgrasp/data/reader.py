@@ -20,7 +20,6 @@ from torchgrasp.files import Field, Recent, read_json
 from torchgrasp.values import Grasps, PointCloud
 
 CARD = "card.json"  # file that describes a data set; it is written last, so a folder that has one is whole
-MOST_CARD = 256 * 1024 * 1024  # most bytes of a card: a million jobs take 250 each
 KEPT = 32  # shards that stay in memory: of 64 jobs with 20 grasps each one takes 3 MB, mostly clouds
 
 
@@ -163,12 +162,13 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     >>> data[0]["points"].shape, data.jobs[0].object, data.job(0).row.grasps
     (torch.Size([100, 3]), 'carton', 1)
     """
+    most_card = 256 * 1024 * 1024  # most bytes of a card: a million jobs take 250 each
     folder = Path(folder)
 
     def refuse(found: str, allowed: str) -> ModelFileError:
         return ModelFileError("folder", found, allowed)
 
-    card = read_json(folder / CARD, refuse, "a folder that `torchgrasp campaign` finished", MOST_CARD)
+    card = read_json(folder / CARD, refuse, "a folder that `torchgrasp campaign` finished", most_card)
     fields = card.entries()
     if missing := {"campaign", "jobs_in_shard", "jobs"} - set(fields):
         raise card.wrong(f"a file with {min(missing)!r}")

@@ -14,8 +14,6 @@ from torch import Tensor
 
 from torchgrasp.checks import Measured, Seed, checked
 
-RESAMPLES = 10_000  # number of resamples behind an interval
-
 Counts = Mapping[str, tuple[int | float, int]]
 """Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and number of values."""
 
@@ -83,6 +81,7 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
 
     `total` counts the trials of the first column. Resamples without a trial in some column do not count.
     """
+    resamples = 10_000  # number of resamples behind an interval
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
     total = sum(total for _, total in columns[0].values())
     if not names:
@@ -91,8 +90,8 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
     value = float(_combine(table.sum(0), weights))
     if len(names) == 1:
         return Share(value, math.nan, math.nan, total, 1)
-    drawn = torch.randint(len(names), (RESAMPLES, len(names)), generator=torch.Generator().manual_seed(seed))
-    times = torch.zeros(RESAMPLES, len(names), dtype=torch.float64)
+    drawn = torch.randint(len(names), (resamples, len(names)), generator=torch.Generator().manual_seed(seed))
+    times = torch.zeros(resamples, len(names), dtype=torch.float64)
     times.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.float64))
     values = _combine(torch.einsum("ru,uck->rck", times, table), weights)
     low, high = values.nanquantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()

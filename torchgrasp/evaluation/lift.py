@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     import trimesh
 
 LIFT_TIME = 1.0  # time [s] in which the hand rises
-SHAKE_RATE = 5.0  # frequency of the shaking [Hz]
-JUDGED_TIME = 0.2  # time [s] at the end of a trial in which contacts are counted
 PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre during the closing that counts as ejected
 LOST_DISTANCE = 0.5  # distance [m] of the object, beyond the lift, at which the trial ends
 SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
@@ -177,11 +175,12 @@ class _Lift:
 
     def _height(self, time: float, rising: float) -> tuple[float, float]:
         """Return height [m] and speed [m/s] of a hand that rises for `rising` seconds."""
+        rate_hz = 5.0  # frequency of the shaking [Hz]
         share, rate = smooth_step(min(time / rising, 1.0))
         height = self.spec.lift_height * share
         if time < rising or self.spec.shake == 0.0:
             return height, self.spec.lift_height * rate / rising
-        frequency = 2 * math.pi * SHAKE_RATE
+        frequency = 2 * math.pi * rate_hz
         phase = frequency * (time - rising)
         return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)
 
@@ -212,9 +211,10 @@ class _Lift:
 
     def _verdict(self) -> Status:
         """Return whether the object is held, or the first failure."""
+        judged_time = 0.2  # time [s] at the end of a trial in which contacts are counted
         rise = np.array([tick.centre[2] - self.ticks[0].centre[2] for tick in self.ticks])
         half = 0.5 * self.spec.lift_height
-        gripped = np.array([tick.touching >= 2 for tick in self.ticks[-self.run.robot.ticks(JUDGED_TIME) :]])
+        gripped = np.array([tick.touching >= 2 for tick in self.ticks[-self.run.robot.ticks(judged_time) :]])
         if rise[-1] >= half and gripped.mean() > 0.5:
             slip = self._motion(self.pressed, -1)
             return Status.OK if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE else Status.SLIPPED

@@ -22,8 +22,6 @@ from torchgrasp.threads import single_threaded
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """-x, +x, -y, +y, -z, +z of the world."""
 
-CHECK_SECONDS = 0.2  # interval [s] at which the pulled object's motion is checked
-
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +80,7 @@ def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
 
 def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status, np.ndarray, float]:
     """Close the hand and pull; return status, largest motion [m, rad], and the force [N] before the pull."""
+    interval = 0.2  # interval [s] at which the pulled object's motion is checked
     if not run.starts:
         return Status.START_OVERLAP, np.zeros(2), math.nan
     start = run.scene.object_pose()
@@ -93,8 +92,8 @@ def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status,
         return Status.EJECTED if status is Status.MOVED else status, motion, force
     run.scene.pull(spec.acceleration * run.mass * direction)
     largest = np.zeros(2)
-    for _ in range(round(spec.seconds / CHECK_SECONDS)):
-        for _ in range(run.robot.ticks(CHECK_SECONDS)):
+    for _ in range(round(spec.seconds / interval)):
+        for _ in range(run.robot.ticks(interval)):
             run.step()
         status, motion = _look(run, spec, start)
         largest = np.maximum(largest, motion)

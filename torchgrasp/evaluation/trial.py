@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     Solid = trimesh.Trimesh | Path | str
 
-APPROACH_SPEED = 0.2  # mean speed [m/s] of an unguarded approach
-
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -170,6 +168,7 @@ class TrialRun:
 
     def approach(self) -> Iterator[None]:
         """Bring the opened hand straight to its pre-grasp, guarded or in one sweep."""
+        speed = 0.2  # mean speed [m/s] of an unguarded approach
         if self.controller.approaching:
             self.observation = self.robot.tick(self.controller.targets)
             yield
@@ -179,7 +178,7 @@ class TrialRun:
             self.scene.approach(0.0)
             return
         length = self.spec.approach
-        ticks = self.robot.ticks(length / APPROACH_SPEED) if length else 0
+        ticks = self.robot.ticks(length / speed) if length else 0
         for k in range(ticks):
             share, rate = smooth_step((k + 1) / ticks)
             self.scene.approach(length * (1 - share), length * rate / (ticks * self.robot.period))

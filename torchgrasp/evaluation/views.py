@@ -30,7 +30,6 @@ from torchgrasp.values import Grasps, PointCloud, load_grasps
 if TYPE_CHECKING:
     import trimesh
 
-MOST_FRICTION = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
 
 Ranks = Literal["best", "spread"]
@@ -121,6 +120,7 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
     Raises:
         MissingExtra, OutputError: errors that are independent of the object.
     """
+    most_friction = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
     hand, score = view.load_hand(), view.score
     started = time.process_time()
     try:
@@ -129,7 +129,7 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
         if planned is not None:
             return PlannedView(*_read_planned(planned, score, cloud, hand))
         started = time.process_time()
-        contacts = ContactSpec(friction=min(friction, MOST_FRICTION), table=Plane.horizontal(0.0))
+        contacts = ContactSpec(friction=min(friction, most_friction), table=Plane.horizontal(0.0))
         stages: dict[str, Any] = {}
         found = plan_grasps(
             cloud, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers,

@@ -31,7 +31,6 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, Grasps
 
 MOST_GRASPS = 100_000  # most grasps of a file: more are no plan of one object
-UNIT = 1e-3  # largest difference from 1 of a quaternion's length in a file of few digits
 FAR = 100.0  # largest number of a pose or posture [m, rad] in a JSON file
 
 Quaternion = Literal["wxyz", "xyzw"]
@@ -185,10 +184,11 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
 
 def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
     """Return poses from positions and quaternions."""
+    tolerance = 1e-3  # largest difference from 1 of a quaternion's length in a file of few digits
     from scipy.spatial.transform import Rotation
 
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
-    far = np.abs(np.linalg.norm(turns, axis=1) - 1) > UNIT
+    far = np.abs(np.linalg.norm(turns, axis=1) - 1) > tolerance
     if far.any():
         length = float(np.linalg.norm(turns[far][0]))
         raise _refuse(f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}", "length 1")
@@ -196,10 +196,6 @@ def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"
     pose = torch.eye(4, dtype=torch.float64).repeat(len(numbers), 1, 1)
     pose[:, :3, :3], pose[:, :3, 3] = torch.tensor(matrices), torch.tensor(numbers[:, :3])
     return pose
-
-
-OPENING, OPENING_STEPS = 0.02, 4
-"""How far [m] fingertips stand off where no pre-grasp is given, and in how many linear steps: within 1 mm."""
 
 
 @checked
@@ -269,8 +265,10 @@ def grasps_from_joints(
 
 def _open(hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]) -> Float[Tensor, "g h"]:
     """Return joints whose fingertips stand off along the contacts' normals, within the limits."""
-    for _ in range(OPENING_STEPS):
+    # How far [m] fingertips stand off where no pre-grasp is given, and in how many linear steps: within 1 mm
+    opening, steps = 0.02, 4
+    for _ in range(steps):
         jacobian = hand.jacobian(joints).flatten(1, 2)
-        step = damped_inverse(jacobian) @ (OPENING / OPENING_STEPS * away).flatten(1)[..., None]
+        step = damped_inverse(jacobian) @ (opening / steps * away).flatten(1)[..., None]
         joints = torch.minimum(torch.maximum(joints + step[..., 0], hand.lower), hand.upper)
     return joints

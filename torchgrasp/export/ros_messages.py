@@ -19,8 +19,6 @@ from torchgrasp.values import Grasps
 OBJECT_FRAME = "object"
 """Name of the object's frame in the messages: the frame of the cloud; publish a transform of that name."""
 
-DIGITS = 9  # decimals of a number [nm, nrad]: YAML 1.1 takes 1e-05 for a text, so none has an exponent
-
 
 @checked
 def format_moveit(
@@ -155,8 +153,9 @@ def _lines(value: Any) -> list[str]:
 
 def _scalar(value: Any) -> str:
     """Return a scalar, or a list of them, in one line."""
+    digits = 9  # decimals of a number [nm, nrad]: YAML 1.1 takes 1e-05 for a text, so none has an exponent
     if isinstance(value, list):
         return f"[{', '.join(map(_scalar, value))}]"
     if isinstance(value, float):
-        return f"{value:.{DIGITS}f}" if math.isfinite(value) else ".nan"
+        return f"{value:.{digits}f}" if math.isfinite(value) else ".nan"
     return str(value) if isinstance(value, int) else f'"{value}"'

@@ -14,9 +14,6 @@ from torch import Tensor
 from torchgrasp.errors import DegenerateContacts
 from torchgrasp.geometry.linalg import unit
 
-MIN_HEIGHT_RATIO = 1e-3
-"""Least height of the largest contact triangle over its longest side: noise turns the frame of a flatter one."""
-
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the homogeneous transform of a rotation and a translation [m]."""
@@ -88,12 +85,14 @@ def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
 
 
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
-    """Return which contacts lie near a line: their largest triangle is flatter than `MIN_HEIGHT_RATIO`."""
+    """Return which contacts lie near a line: their largest triangle is flatter than `min_ratio`."""
+    # Least height of the largest contact triangle over its longest side: noise turns the frame of a flatter one
+    min_ratio = 1e-3
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
     sides = corners - corners.roll(1, dims=-2)
     longest = torch.linalg.vector_norm(sides, dim=-1).amax((-1, -2))
     doubled_area = torch.linalg.vector_norm(torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1).amax(-1)
-    return ~(doubled_area > MIN_HEIGHT_RATIO * longest**2)
+    return ~(doubled_area > min_ratio * longest**2)
 
 
 def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:

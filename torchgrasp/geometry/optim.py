@@ -16,8 +16,6 @@ from torch import Tensor
 from torchgrasp.base import Batch, pick, put
 
 SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
-STALLED = 0.02  # relative decrease of the sum of squares below which a row of `LeastSquares` has converged
-LOST = 30.0  # damping beyond which a refused step ends a row of `LeastSquares`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +138,9 @@ class LeastSquares(Problem[State, LinearResiduals]):
         self, model: LinearResiduals, trial: LinearResiduals, x: Float[Tensor, "a d"], damping: Damping
     ) -> Verdict:
         """Accept what lowers the sum."""
+        lost = 30.0  # damping beyond which a refused step ends a row of `LeastSquares`
+        stalled = 0.02  # relative decrease of the sum of squares below which a row of `LeastSquares` has converged
         better = trial.cost < model.cost
-        rests = torch.where(better, trial.cost > (1 - STALLED) * model.cost, damping > LOST)
+        rests = torch.where(better, trial.cost > (1 - stalled) * model.cost, damping > lost)
         after = torch.where(better, damping / 3, damping * 4).clamp(1e-6, 1e6)
         return better, torch.where(rests, torch.inf, after)

@@ -24,10 +24,6 @@ from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.urdf import Mimic, Shape, Triple, Urdf
 from torchgrasp.limits import HAND_SEPARATIONS, HAND_SHAPE_PAIRS
 
-FINGER_CELL, PALM_CELL = 0.015, 0.022
-"""Edge of the cells of fingers and palm [m]; edges and corners stick farther out of the spheres of larger cells."""
-SINGLE_LAYER = 0.025  # a shape thinner than this [m] has one layer of cells across
-BULGE = 0.004  # how far a sphere may stand out of a shape's faces [m], other than a fingertip's
 MEETING_DISTANCE = 0.002  # links that come nearer than this [m] in some posture are a pair to test
 ALWAYS = 0.98  # links that overlap in a larger share of the postures overlap by construction: they are no pair to test
 
@@ -50,16 +46,19 @@ class CollisionSpheres(Value):
 
 def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
     """Cover every collision shape of a URDF with spheres."""
+    bulge = 0.004  # how far a sphere may stand out of a shape's faces [m], other than a fingertip's
+    # Edge of the cells of fingers and palm [m]; edges and corners stick farther out of the spheres of larger cells
+    finger_cell, palm_cell = 0.015, 0.022
     owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
     tips = [f.tip_link for f in spec.fingers]
     rows: list[tuple[int, Triple, float, int, bool]] = []
     for index, link in enumerate(urdf.links):
         movers, touching = urdf.movers(link.name), link.name in tips
         finger = owner.get(movers[0].name, -2) if movers else -1
-        cell = PALM_CELL if finger == -1 else FINGER_CELL
+        cell = palm_cell if finger == -1 else finger_cell
         for shape in link.shapes:
             # a tip's contact is known exactly: no sphere may touch before it
-            centers, radius = _cover(shape, cell, 0.0 if touching else BULGE)
+            centers, radius = _cover(shape, cell, 0.0 if touching else bulge)
             rows += [(index, center, radius, finger, touching) for center in centers]
     link_index, center, radius, finger, touching = zip(*rows, strict=True)
     center, radius = torch.tensor(center, dtype=torch.float64), torch.tensor(radius, dtype=torch.float64)
@@ -68,12 +67,13 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
 
 def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
     """Return centres and radius of the spheres that cover a shape."""
+    single_layer = 0.025  # a shape thinner than this [m] has one layer of cells across
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
     cylinder = shape.kind == "cylinder"
     # a cylinder is cut as its bounding box
     size = (2 * shape.size[0], 2 * shape.size[0], shape.size[1]) if cylinder else shape.size
-    counts = [1 if x == min(size) and x < SINGLE_LAYER else max(1, round(x / cell)) for x in size]
+    counts = [1 if x == min(size) and x < single_layer else max(1, round(x / cell)) for x in size]
     half = [x / n / 2 for x, n in zip(size, counts, strict=True)]
     thinnest = min((x / 2 for x, n in zip(size, counts, strict=True) if n == 1), default=math.inf)
     radius = min(math.hypot(*half) - 0.001, thinnest + bulge)

@@ -30,8 +30,6 @@ NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
 """Nodes of a line, in standard deviations of the surface at its contact: three err by 0.07, five by 0.02 at most."""
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
 """Outer half of the grid, in the same unit; it holds all nodes."""
-ROWS_PER_CHUNK = 32
-"""Rows whose joint posterior is made at a time: 105 x 105 distances of three contacts, which stay in the cache."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,12 +118,14 @@ def _along_lines(
     shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]]:
     """Return deviation, distance on the grid, slope and covariance at the nodes for a single surface."""
+    # Rows whose joint posterior is made at a time: 105 x 105 distances of three contacts, which stay in the cache
+    rows_per_chunk = 32
     jet = shape.jet(points.flatten(0, 1))
     deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
     values = 4 * len(NODES) * points.shape[1]
     covariance = points.new_empty(len(points), values, values)
-    for rows in torch.arange(len(points), device=points.device).split(ROWS_PER_CHUNK):
+    for rows in torch.arange(len(points), device=points.device).split(rows_per_chunk):
         covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
     slope = shape.mean_and_gradient((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
     t = deviation[..., None] * grid().to(deviation)
@@ -174,7 +174,6 @@ def first_contact(
     return lines.points[:, None] + motion * lines.normals[:, None], unit((weights @ slope)[..., 0, :])
 
 
-DRAWS_PER_CHUNK = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
 GPU_DRAWS = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
 
 
@@ -240,10 +239,11 @@ def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
     """Return the share of n drawn surfaces on which the fingers' contacts are closed."""
+    draws_per_chunk = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))
     guess = None if lines.points.shape[1] == 3 else first_balance(lines.points, lines.normals, friction)
-    at_once, judged = min(n, DRAWS_PER_CHUNK), DRAWS_PER_CHUNK if count.device.type == "cpu" else GPU_DRAWS
+    at_once, judged = min(n, draws_per_chunk), draws_per_chunk if count.device.type == "cpu" else gpu_draws
     for start in range(0, n, at_once):
         standard = torch.randn(min(at_once, n - start), lines.root.shape[-1], dtype=torch.float64, generator=generator)
         for rows in torch.arange(len(lines), device=count.device).split(max(judged // len(standard), 1)):

@@ -22,7 +22,6 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds, PointCloud
 
-TRIAL_STARTS = 100  # starts with which a change is tried
 MOST_TRIALS = 8  # most changes that are tried
 
 
@@ -192,8 +191,9 @@ def explain_empty(
     >>> explanation.best.words
     'if the friction were 0.4 instead of 0'
     """
+    starts_tried = 100  # starts with which a change is tried
     request = Request(cloud, hand, spec, starts, seed, **options)
-    few = dataclasses.replace(request, starts=min(starts, TRIAL_STARTS))
+    few = dataclasses.replace(request, starts=min(starts, starts_tried))
     funnel, _, shape = try_request(few)
     trials = list[Trial]()
 

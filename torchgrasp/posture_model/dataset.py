@@ -26,7 +26,6 @@ from torchgrasp.posture_model.sample import (
 )
 
 MANIFEST = "samples.json"  # file that describes the samples of a folder
-MAX_MANIFEST = 1024 * 1024  # most bytes of a manifest: the file of a stranger must not fill the memory
 KEPT = 128  # chunks that stay in memory: all of a million postures, which take 200 MB
 META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")  # the keys of `SampleSpec.meta`
 
@@ -177,12 +176,13 @@ def load_samples(folder: Path | str) -> SampleFolder:
     ...     load_samples(folder).read(50).joints.shape
     torch.Size([50, 4])
     """
+    max_manifest = 1024 * 1024  # most bytes of a manifest: the file of a stranger must not fill the memory
     folder = Path(folder)
 
     def refuse(found: str, allowed: str) -> ModelFileError:
         return ModelFileError("folder", found, allowed)
 
-    manifest = read_json(folder / MANIFEST, refuse, "a folder written by write_samples", MAX_MANIFEST)
+    manifest = read_json(folder / MANIFEST, refuse, "a folder written by write_samples", max_manifest)
     samples = _parse_manifest(folder, manifest)
     chunks = len(chunk_sizes(samples.n))
     if missing := sum(not samples.path(i).is_file() for i in range(chunks)):

@@ -50,8 +50,6 @@ class Shard:
 
 
 CACHED_ROWS = 2048  # rows of one pass: their features and responsibilities stay in the cache
-GPU_ROWS = 2**17
-"""Rows of one pass on a GPU, which smaller passes leave idle; features take 200 MB (`scripts/bench.py gpu`)."""
 SINGULAR_VARIANCE = 1e-12  # a conditional variance of this size is rounding, beside the data's variance of 1
 MAX_RESEEDS = 3  # a component that collapses more often shows that the data support fewer components
 
@@ -121,9 +119,11 @@ def expectation_maximisation(
 
 def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
     """Return the responsibility-weighted sums of the features, and the log-likelihood of all data, Eq. (19)."""
+    # Rows of one pass on a GPU, which smaller passes leave idle; features take 200 MB (`scripts/bench.py gpu`)
+    gpu_rows = 2**17
     x, coefficients = shard.rows, coefficients_from_components(components)
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
-    at_once = min(CACHED_ROWS if x.device.type == "cpu" else GPU_ROWS, len(x))
+    at_once = min(CACHED_ROWS if x.device.type == "cpu" else gpu_rows, len(x))
     features, joint = x.new_empty(coefficients.shape[1], at_once), x.new_empty(len(coefficients), at_once)  # reused
     floor = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; denormal numbers are slow
     for rows in x.split(at_once):
@@ -208,15 +208,12 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
     return Components(count[:, 0] / n, means, second - means[:, :, None] * means[:, None, :] + ridge)
 
 
-SUBSAMPLE = 20_000  # rows among which k-means++ chooses its centres: some hundred for each component
-LLOYD_ROUNDS = 10  # rounds of Lloyd's algorithm: EM follows, so the clusters need not converge
-
-
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
     """Return the clusters of k-means as m components; fewer different rows raise `BadArgument`."""
+    rounds = 10  # rounds of Lloyd's algorithm: EM follows, so the clusters need not converge
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
-    for _ in range(LLOYD_ROUNDS):
+    for _ in range(rounds):
         sums = _sums_of_clusters(shard, centres, _ones_and_data)
         centres = torch.where(sums[:, :1] > 0, sums[:, 1:] / sums[:, :1], centres)  # a centre without data stays
     sums = _sums_of_clusters(shard, centres, features_from_data)
@@ -227,12 +224,13 @@ def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> 
 
 def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]:
     """Return random rows of all data, the same in every process."""
+    subsample = 20_000  # rows among which k-means++ chooses its centres: some hundred for each component
     x = shard.rows
     lengths = x.new_zeros(shard.processes, dtype=torch.int64)
     lengths[shard.rank] = len(x)
     lengths = shard.sum(lengths)
     order = torch.randperm(int(lengths.sum()), generator=generator)  # the same for any number of processes
-    pick = order[:SUBSAMPLE].to(x.device) - lengths[: shard.rank].sum()
+    pick = order[:subsample].to(x.device) - lengths[: shard.rank].sum()
     here = (pick >= 0) & (pick < len(x))
     pool = x.new_zeros(len(pick), x.shape[1])
     pool[here] = x[pick[here]]

@@ -71,10 +71,6 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     )
 
 
-CODE_TOLERANCE = 1e-5
-"""Largest difference of two codes [m or cosine] by rounding: `describe_compatibility` writes seven digits."""
-
-
 def describe_compatibility(hand: Hand) -> dict[str, str]:
     """Return the metadata of samples and models about their hand: name, fingers, hash of its files, some codes."""
     codes = " ".join(f"{x:.7f}" for x in _probe_codes(hand).flatten().tolist())
@@ -83,6 +79,8 @@ def describe_compatibility(hand: Hand) -> dict[str, str]:
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
     """Refuse a model of another hand, fingers, limits or fingertips; without `hand_codes`, of other joint names."""
+    # Largest difference of two codes [m or cosine] by rounding: `describe_compatibility` writes seven digits
+    tolerance = 1e-5
     if joint_names != hand.joint_names:
         raise BadArgument("mixture", f"joints {joint_names}", f"the joints {hand.joint_names} of the hand")
     if "hand_codes" not in meta:
@@ -92,7 +90,7 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
         theirs = torch.tensor([float(x) for x in meta["hand_codes"].split()], dtype=torch.float64)
     except ValueError as error:
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
-    if theirs.shape != ours.shape or not torch.allclose(theirs.to(ours), ours, rtol=0, atol=CODE_TOLERANCE):
+    if theirs.shape != ours.shape or not torch.allclose(theirs.to(ours), ours, rtol=0, atol=tolerance):
         whose = f"hand {meta.get('hand')!r}, fingers {meta.get('fingers')!r}, of other limits or fingertips"
         allowed = f"one of {hand.name!r}, {hand.source.option!r}: train it anew"
         raise BadArgument("mixture", f"a model of {whose}", allowed)

@@ -79,7 +79,6 @@ CHUNK_POSTURES = 10_000
 """Free postures from one generator. It is no argument, because another number gives a seed other postures."""
 BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for the same reason
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
-LEAST_KEPT = 1e-3  # least share of postures that are kept, after ten blocks: another hand would draw for hours
 
 Sampling = Literal["uniform", "grasping"]
 """Which free postures are taken.
@@ -169,12 +168,13 @@ def chunk_sizes(n: int) -> list[int]:
 
 def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
     """Return the kept postures of chunk i, their codes, and the number of postures drawn for them."""
+    least_kept = 1e-3  # least share of postures that are kept, after ten blocks: another hand would draw for hours
     count, parts, kept = chunk_sizes(spec.n)[i], [], 0
     blocks = _draw_blocks(hand, np.random.default_rng((spec.seed, i)), spec.sampling)
     while kept < count:
         parts.append(next(blocks))
         kept, drawn = kept + len(parts[-1][0]), BLOCK_POSTURES * len(parts)
-        if kept < LEAST_KEPT * drawn and len(parts) >= 10:
+        if kept < least_kept * drawn and len(parts) >= 10:
             raise BadArgument("hand", f"{kept} kept of {drawn} postures", "a hand that can move freely")
     joints, q = (torch.cat(tensors)[:count] for tensors in zip(*parts, strict=True))
     return joints, q, BLOCK_POSTURES * len(parts)

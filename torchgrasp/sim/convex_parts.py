@@ -104,8 +104,6 @@ if __name__ == "__main__":
     main(json.loads(sys.argv[1]))
 
 
-MAX_PARTS = 1000  # most parts that a caller may give
-
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """CoACD's search for cuts, narrower and faster than its default."""
 
@@ -176,8 +174,9 @@ def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
     """Return the caller's parts; refuse parts that are not convex, and too many parts."""
-    if len(parts) > MAX_PARTS:
-        raise MeshError("parts", f"{len(parts)} parts", f"at most {MAX_PARTS}")
+    max_parts = 1000  # most parts that a caller may give
+    if len(parts) > max_parts:
+        raise MeshError("parts", f"{len(parts)} parts", f"at most {max_parts}")
     for index, part in enumerate(parts):
         check_solid(part, f"part {index}")
         if not part.is_convex:

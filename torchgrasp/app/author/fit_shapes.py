@@ -23,11 +23,8 @@ if TYPE_CHECKING:
     import trimesh
 
 MESH_KINDS = (".stl", ".obj", ".ply")  # formats of meshes that contain only geometry
-SAMPLES = 4000  # points on each shape
 SAVING, SAVING_TIP = 0.12, 0.04
 """A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of all boxes."""
-ROUND = 0.9  # a cylinder replaces boxes if its volume is less than this share of their volume
-TURNED = 0.85  # boxes are turned out of the link's axes if one box then has less than this share of its volume
 
 Points = Float[np.ndarray, "_ 3"]
 """Points, of any count in each use."""
@@ -145,15 +142,17 @@ def _primitive_points(shape: Shape) -> Points:
 
 def _sample(mesh: "trimesh.Trimesh") -> Points:
     """Return points on a mesh, with its corners."""
+    count = 4000  # points on each shape
     from trimesh.sample import sample_surface
 
-    points = np.asarray(sample_surface(mesh, SAMPLES, seed=0)[0])
+    points = np.asarray(sample_surface(mesh, count, seed=0)[0])
     vertices = np.asarray(mesh.vertices)
-    return np.concatenate([points, vertices[:: len(vertices) // SAMPLES + 1]])
+    return np.concatenate([points, vertices[:: len(vertices) // count + 1]])
 
 
 def fit_shapes(points: Points) -> list[Shape]:
     """Cover points on a body by a few boxes, or by a cylinder."""
+    round_share = 0.9  # a cylinder replaces boxes if its volume is less than this share of their volume
     turn = _axes(points)
     local = points @ turn
     boxes = _cut(local, 3 if float(np.ptp(local, axis=0).max()) < 0.08 else 8, SAVING)
@@ -162,7 +161,7 @@ def fit_shapes(points: Points) -> list[Shape]:
     middle, sides = (low + high) / 2, high - low
     for axis in range(3):
         radius = float(np.linalg.norm(np.delete(local - middle, axis, 1), axis=1).max())
-        if math.pi * radius**2 * sides[axis] < ROUND * volume:
+        if math.pi * radius**2 * sides[axis] < round_share * volume:
             along = np.roll(np.eye(3), -axis - 1, 0).T  # its third column is the axis
             return [_shape("cylinder", (radius, sides[axis]), turn @ along, turn @ middle)]
     return _boxes(boxes, turn)
@@ -170,13 +169,14 @@ def fit_shapes(points: Points) -> list[Shape]:
 
 def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
     """Return the axes of the boxes as columns: the link's axes, unless others fit much better."""
+    turned_share = 0.85  # a box is turned out of the link's axes if its volume falls below this share
     from trimesh.bounds import oriented_bounds
 
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-7 * math.sqrt(len(points))) < 3:  # a flat body has no hull
         return np.eye(3)
     turned, sizes = oriented_bounds(points)
     straight = np.prod(np.ptp(points, axis=0))
-    return turned[:3, :3].T if np.prod(sizes) < TURNED * straight else np.eye(3)
+    return turned[:3, :3].T if np.prod(sizes) < turned_share * straight else np.eye(3)
 
 
 def _boxes(corners: list[Corners], axes: np.ndarray) -> list[Shape]:

@@ -14,8 +14,6 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.hand.urdf import SIZES, Joint, Link, Mimic, Shape, Triple, Urdf
 
 EFFORT, VELOCITY = 1.0, 3.0  # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
-LEAST_MASS, LEAST_SIZE = 1e-3, 5e-3
-"""Least mass [kg] and edge [m] of a body without mass, so that simulators remain stable."""
 
 Step = tuple[Urdf, list[str]]
 
@@ -179,15 +177,17 @@ def repair_joints(urdf: Urdf) -> Step:
 
 def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
     """Add masses and inertias where they are missing or impossible for a body; `surfaces` are points (n, 3)."""
+    # Least mass [kg] and edge [m] of a body without mass, so that simulators remain stable
+    least_mass, least_size = 1e-3, 5e-3
     far_out = 2.0  # farthest mass centre and radius of gyration, in half diagonals of the bounding box
     links, weightless, absurd = [], list[str](), list[str]()
     for link in urdf.links:
         points = surfaces.get(link.name, np.zeros((1, 3)))
         low, high = points.min(0), points.max(0)
-        size = np.maximum(high - low, LEAST_SIZE)
+        size = np.maximum(high - low, least_size)
         reach, middle, mass = float(np.linalg.norm(size)) / 2, (low + high) / 2, link.mass
         if not mass > 0:
-            mass = max(LEAST_MASS, 500.0 * float(np.prod(high - low)))  # half of the box is filled with 1000 kg/m3
+            mass = max(least_mass, 500.0 * float(np.prod(high - low)))  # half of the box is filled with 1000 kg/m3
             weightless.append(f"{link.name} ({1e3 * mass:.3g} g)")
         principal = np.linalg.eigvalsh(_matrix(link.inertia))
         sound = principal[0] > 0 and principal[0] + principal[1] >= principal[2] * (1 - 1e-6)

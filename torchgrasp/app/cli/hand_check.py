@@ -20,8 +20,6 @@ from torchgrasp.planner.problem import finger_sets
 from torchgrasp.posture_model.sample import can_close
 from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
-FREE, FACING, CLOSING = 0.2, 0.02, 0.001
-"""Least shares of random postures that are free, face a pad to the others, and can hold an object; three fingers."""
 TRIAL_STARTS = 100  # initial guesses with which a hand is tried on a shipped object
 
 
@@ -92,9 +90,11 @@ def describe_sets(hand: Hand) -> str:
 
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     """Return warnings on a sound hand, judged by random postures `joints` (n, h) [rad], each with its fix."""
+    # Least shares of random postures that are free, face a pad to the others, and can hold an object; three fingers
+    least_free, least_facing, least_closing = 0.2, 0.02, 0.001
     warnings, free, named = [], hand.self_clearance(joints) > 0, f"[options.{hand.source.option}]"
     share = float(free.double().mean())
-    if share < FREE ** (len(hand.tips) / 3):
+    if share < least_free ** (len(hand.tips) / 3):
         one, two = most_met(hand, joints[:500])
         warnings.append(
             f"only {share:.0%} of random postures are free, most often {one} meets {two}: if this is impossible, make "
@@ -104,13 +104,13 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     inward = points.mean(1, keepdim=True) - points
     facing = ((normals * inward).sum(-1) / torch.linalg.vector_norm(inward, dim=-1) > 0.5).double().mean(0)
     for name, seen in zip(hand.finger_names, facing.tolist(), strict=True):
-        if seen < FACING:
+        if seen < least_facing:
             warnings.append(
                 f"the pad of {name} faces the others in {seen:.1%} of free postures: if its arrow in the picture "
                 f"points the wrong way, turn contact and normal in hand.toml; or name other fingers in {named}"
             )
     closing = float(can_close(points, normals).double().mean()) if len(points) else 0.0
-    if closing < CLOSING:
+    if closing < least_closing:
         warnings.append(
             f"{closing:.2%} of free postures can hold an object: give {named} the thumb and fingers that it faces"
         )

@@ -5,8 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-SAMPLES = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
-
 
 class Triangles(NamedTuple):
     """Corners of triangles with normals and colours in [0, 1]; unlit triangles keep their colours."""
@@ -55,7 +53,8 @@ def render(
     background: tuple[float, float, float],
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the picture of opaque triangles under the nearest layer of half-transparent triangles."""
-    width, height = size[0] * SAMPLES, size[1] * SAMPLES
+    samples = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
+    width, height = size[0] * samples, size[1] * samples
     image = np.tile(np.array(background, dtype=np.float32), (height * width, 1))
     near = np.zeros(height * width, dtype=np.float32)
     sample, inverse_distance, color = _cast(_project(solid, camera, width, height), width, height)
@@ -63,7 +62,7 @@ def render(
     sample, inverse_distance, color = _cast(_project(transparent, camera, width, height), width, height)
     front = inverse_distance > near[sample]
     image[sample[front]] += 0.5 * (color[front] - image[sample[front]])
-    pixels = image.reshape(size[1], SAMPLES, size[0], SAMPLES, 3).mean((1, 3))
+    pixels = image.reshape(size[1], samples, size[0], samples, 3).mean((1, 3))
     return (255.0 * np.clip(pixels, 0.0, 1.0) + 0.5).astype(np.uint8)
 
 
