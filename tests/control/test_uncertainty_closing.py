@@ -221,8 +221,16 @@ def test_position_closing_stops_each_finger_for_good():
     assert law(observation(0.02), PERIOD).reshape(3, 3)[0].abs().max() == 0
     law(observation(), PERIOD)  # nothing is felt at the planned contacts: it continues
     assert not law.done
+    law(observation(0.0015 - 0.02), PERIOD)  # a fingertip stops within 1 mm of its aim
+    assert not law.done
     law(observation(0.0005 - 0.02), PERIOD)
     assert law.done
+
+
+def test_position_closing_stops_at_the_papers_force():
+    law = PositionClosing(reference())
+    step = law(observation(0.02, (0.45, 0.55, 0.0)), PERIOD).reshape(3, 3).abs().amax(-1)  # Sec. 6.5: 0.5 N
+    assert (step > 0).tolist() == [True, False, True]
 
 
 def test_paper_position_closing_aims_at_the_contacts():

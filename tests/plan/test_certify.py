@@ -1,6 +1,7 @@
 """Certificates against a programme written from Eq. (13) alone, and the cases in which Eq. (13) is not enough."""
 
 import math
+import sys
 from fractions import Fraction
 
 import numpy as np
@@ -197,3 +198,12 @@ def test_no_rows_give_no_certificates():
 def test_bad_arguments_name_what_was_found():
     with pytest.raises(BadArgument, match="unit vectors"):
         certify(Contacts(triangle(), 1.01 * triangle()), SPEC)
+
+
+@pytest.mark.parametrize(("residual", "closed"), [(1e-7, True), (1e-5, False), (1e-3, False)])
+def test_certify_accepts_no_balance_with_a_residual(monkeypatch, residual, closed):
+    points = triangle()
+    module = sys.modules["torchgrasp.plan.certify"]  # the package has a function of this name
+    monkeypatch.setattr(module, "EXACT", -1.0)  # every row is given to HiGHS
+    monkeypatch.setattr(module, "solve_by_highs", lambda wrench: (0.01, residual, None))
+    assert bool(certify(Contacts(points, points), SPEC).closed) is closed

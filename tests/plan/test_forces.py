@@ -211,3 +211,15 @@ def test_forces_of_more_contacts_are_nan_without_a_balance():
     forces = least_friction_forces(points, normals)
     assert bool(torch.isnan(forces[[0, 2]]).all())
     torch.testing.assert_close(forces[1], alone[1])
+
+
+@FINGERTIPS
+def test_least_friction_forces_come_nearer_to_the_preferred_ones(fingertips):
+    points, normals = tripods(60, 3, fingertips)
+    wanted = torch.linspace(1.0, 0.4, fingertips, dtype=torch.float64)
+
+    def off(preferred):
+        forces = least_friction_forces(points, normals, 1.0, preferred)
+        return (-(forces * normals).sum(-1) - wanted).abs().nanmean()
+
+    assert off(wanted[None]) < 0.97 * off(None)

@@ -12,9 +12,9 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure import wrenches
 from torchgrasp.plan.feasibility import check_feasibility, first_violation, normal_variation
-from torchgrasp.plan.solve import plan_chunk, plan_contacts
+from torchgrasp.plan.solve import TO_CENTRE, plan_chunk, plan_contacts
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.starts import draw_in, settle_flatness
+from torchgrasp.plan.starts import draw_in, drawn_starts, settle_flatness
 from torchgrasp.specs import ContactSpec
 
 SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, flatness=0.6, flat_radius=0.008)}
@@ -58,6 +58,15 @@ def test_eq14_centre_of_the_contacts_approaches_the_centre_of_the_shape(ellipsoi
     centre = good.contacts.points.mean(1) - torch.tensor(ellipsoid.center, dtype=torch.float64)
     torch.testing.assert_close(good.quality, torch.linalg.vector_norm(centre, dim=-1))
     assert float(good.quality.median()) < 0.002  # [m], of half axes of 30 to 60 mm
+
+
+def test_eq14_drawn_rows_are_pulled_towards_the_centre(ellipsoid):
+    settled = settle_flatness(ellipsoid, ContactSpec(), 0)
+    first = next(drawn_starts(ellipsoid, settled, [60], 0))
+    plan = plan_chunk(ellipsoid, settled.spec, first, TO_CENTRE)
+    begun = check_feasibility(ellipsoid, settled.spec, first)
+    good = (plan.status == Status.OK) & (begun.status == Status.OK)
+    assert int(good.sum()) > 5 and float(plan.quality[good].mean()) < 0.9 * float(begun.quality[good].mean())
 
 
 def test_same_seed_gives_the_same_bits_and_another_seed_another_plan(ellipsoid):

@@ -192,6 +192,12 @@ def test_bad_arguments_are_refused_before_any_work():
         plan_grasps(view, hand, ranking="best")  # pyright: ignore[reportArgumentType]
 
 
+def test_another_seed_gives_other_grasps_and_the_same_seed_the_same():
+    view, hand = load_object("cylinder").view, load_hand("barrett")
+    one, two, again = (plan_grasps(view, hand, SPEC, starts=10, seed=seed).obj_from_hand for seed in (1, 2, 1))
+    assert torch.equal(one, again) and len(one) and not (one.shape == two.shape and torch.allclose(one, two))
+
+
 def test_no_triples_is_an_answer():
     """On a cylinder with friction 0 three contacts never close: no grasp, and the statuses say why."""
     seen = []

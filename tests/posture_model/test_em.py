@@ -149,6 +149,10 @@ def test_a_component_is_placed_anew_three_times_and_no_more():
         # half of the heaviest each, to either side: its mean is kept
         middle = (result.means[2] + result.means[heaviest]) / 2
         torch.testing.assert_close(middle, sums[heaviest, 1:6] / sums[heaviest, 0])
+        # apart by one standard deviation along the longest axis
+        spread, axes = torch.linalg.eigh(components_from_sums(sums, len(x), 0.0).covariances[heaviest])
+        apart = (result.means[2] - result.means[heaviest]).abs()
+        torch.testing.assert_close(apart, spread[-1].sqrt() * axes[:, -1].abs())
     with pytest.raises(IndefiniteCovariance, match=r"component 2, of 0\.0 rows, collapsed 4 times"):
         maximisation(sums, len(x), 0.0, torch.tensor([0, 0, MAX_RESEEDS]))
 

@@ -12,6 +12,7 @@ from torchgrasp.shape.conditioning import Criterion
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.kernel import Kernel, KernelName, matern52_kernel
+from torchgrasp.shape.support import STD_FACTORS
 from torchgrasp.values import PointCloud
 
 
@@ -230,3 +231,12 @@ def _normal_error(found: Tensor, points: Tensor) -> Tensor:
     """Return the angle [deg] from the cylinder's outward normals."""
     wanted = torch.cat([points[:, :2] / 0.03, torch.zeros_like(points[:, 2:])], 1)
     return torch.rad2deg(torch.arccos((found * wanted).sum(-1).clamp(-1, 1)))
+
+
+def test_the_less_is_known_of_the_hidden_side_the_larger_is_its_deviation():
+    known = ("whole", "ball", "revolution", "mirrored", "guess", "cut off")
+    for table in (True, False):
+        factors = [STD_FACTORS[kind, table] for kind in known]
+        assert factors == sorted(factors) and factors[-3] < factors[-2] < factors[-1] <= 2.0
+    assert all(STD_FACTORS[kind, True] <= STD_FACTORS[kind, False] for kind in known)
+    assert STD_FACTORS["ball", True] <= STD_FACTORS["vessel", True] < STD_FACTORS["guess", True]

@@ -69,8 +69,10 @@ def test_eq7_and_eq8_equal_a_naive_solve(half_ball: ShapeGP):
     known = _ball_observations()
     x = _queries(half_ball, 20)
     profile, yes = partial(thin_plate, psi=half_ball.psi), torch.ones(1, dtype=torch.bool)
-    y, noise = known.rows()
-    k = covariance(known.x, known.x, known.has_normal, known.has_normal, profile) + torch.diag(noise)
+    has = known.has_normal
+    y = torch.cat([known.distance, *known.normal[has].T])
+    deviation = torch.cat([known.distance_noise, known.normal_noise[has].repeat(3)])  # distances, then x, y, z
+    k = covariance(known.x, known.x, has, has, profile) + torch.diag(deviation**2)
     found = half_ball.predict(half_ball.metres(x))
     for i in range(len(x)):
         star = covariance(x[i : i + 1], known.x, yes, known.has_normal, profile)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.make import real
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.shape.completion.complete import (
     LEAST_NOISE,
@@ -16,7 +17,7 @@ from torchgrasp.shape.completion.complete import (
     Completion,
     complete_cloud,
 )
-from torchgrasp.shape.completion.silhouette import silhouette
+from torchgrasp.shape.completion.silhouette import _project, silhouette
 from torchgrasp.shape.completion.symmetry import SymmetryScorer, planes_near, reflect
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
@@ -164,6 +165,14 @@ def _without_symmetry(cloud: PointCloud) -> PointCloud:
     angle = torch.atan2(cloud.points[:, 1], cloud.points[:, 0])
     wave = 0.006 * torch.sin(4 * angle + 100 * cloud.points[:, 2] + 1)
     return PointCloud(cloud.points + wave[:, None] * cloud.normals, cloud.normals, cloud.viewpoint)
+
+
+def test_project_faces_the_middle_of_the_points():
+    corners = real([[-1.0, -2, 3], [5, 4, 9], [0, 0, 4]])
+    axes, pixels, depth = _project(torch.cat([corners, real([[2.0, 1, 6]])]), real([10.0, 7, -2]))
+    torch.testing.assert_close(pixels[-1], torch.zeros(2, dtype=torch.float64), atol=1e-12, rtol=0)
+    torch.testing.assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64))
+    assert float(depth[-1]) == pytest.approx(164**0.5)
 
 
 def test_silhouette_of_a_ball_is_its_circle():
