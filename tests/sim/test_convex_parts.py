@@ -1,5 +1,7 @@
 """Convex parts of a mesh: volumes, cache, refusals."""
 
+import sys
+
 import numpy as np
 import pytest
 import trimesh
@@ -54,8 +56,9 @@ def test_convex_parts_fill_a_concave_mesh_and_are_cached(tmp_path, capfd):
 def test_decompose_refuses_a_mesh_that_takes_too_long(tmp_path, monkeypatch):
     """The jug takes 4 s; here it has one."""
     pytest.importorskip("coacd")
-    monkeypatch.setattr("torchgrasp.sim.convex_parts.SECONDS", 1.0)
-    monkeypatch.setattr("torchgrasp.sim.convex_parts.SECONDS_PER_FACE", 0.0)
+    module = sys.modules["torchgrasp.sim.convex_parts"]  # the package has a function of this name
+    monkeypatch.setattr(module, "SECONDS", 1.0)
+    monkeypatch.setattr(module, "SECONDS_PER_FACE", 0.0)
     with pytest.raises(MeshError, match=r"3516 faces that CoACD cannot cut in 1 s"):
         convex_parts(load_object("jug").mesh, tmp_path)
     assert not list(tmp_path.iterdir())

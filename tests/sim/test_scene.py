@@ -12,7 +12,7 @@ from tests.laws.scenes import check_scene
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.load import load_hand
-from torchgrasp.sim.mjcf import OBJECT
+from torchgrasp.sim.mujoco_scene import OBJECT
 from torchgrasp.sim.scene import open_scene
 from torchgrasp.sim.scene_spec import (
     APPROACH_JOINT,

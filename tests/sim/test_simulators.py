@@ -95,7 +95,7 @@ def test_scene_mjcf_is_a_complete_model():
     """What is exported opens without this library, and weighs what hand and object weigh."""
     import mujoco
 
-    from torchgrasp.sim.mjcf import scene_mjcf
+    from torchgrasp.sim.mujoco_scene import scene_mjcf
     from torchgrasp.sim.scene_spec import SceneSpec
 
     hand, grasp = pinch("allegro")

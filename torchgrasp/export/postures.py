@@ -16,7 +16,7 @@ from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE
-from torchgrasp.sim.mjcf import add_drive, add_links, format_numbers
+from torchgrasp.sim.mujoco_scene import add_drive, add_links, format_numbers
 from torchgrasp.values import Grasps
 
 CONVENTIONS = {

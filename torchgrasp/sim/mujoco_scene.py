@@ -1,14 +1,29 @@
-"""A scene that MuJoCo simulates."""
+"""A scene that MuJoCo simulates, and its model as MJCF."""
 
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from torchgrasp.errors import HandFileError, MissingExtra
-from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.sim.mjcf import NEIGHBOUR, OBJECT, scene_mjcf
+from torchgrasp.geometry.frames import rotation_from_rpy
+from torchgrasp.hand.hand import Actuator
+from torchgrasp.hand.urdf import Link, Urdf
 from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, StepContacts
-from torchgrasp.sim.scene_spec import MOUNT_DRIVE, SceneSpec, mount_slides
+from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, pair_masks
+
+OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
+"""Names of the object (its body and its free joint), of the table, and of the neighbours by number."""
+
+HAND_BIT, OBJECT_BIT, TABLE_BIT, FREE_BIT = 1, 2, 4, 3
+"""Collision groups, all of which collide except the hand with itself, and the first bit after them."""
+
+OPTION = {"integrator": "implicitfast", "cone": "elliptic", "impratio": "10", "noslip_iterations": "2"}
+"""Of the solver, from DexGraspBench (arXiv 2412.16490)."""
+
+SOLREF, SOLIMP = "0.005 1", "0.5 0.99 0.0001"
+"""Contact springs: time constant [s] and damping ratio, and impedance over depth, as in DexGraspBench."""
 
 
 class MujocoScene(Scene):
@@ -28,7 +43,7 @@ class MujocoScene(Scene):
             raise HandFileError("urdf", f"{spec.urdf_path}: {error}", "a hand that MuJoCo can simulate") from error
         self.data = data = mujoco.MjData(model)
         self.body = model.body(OBJECT).id
-        urdf = read_urdf(spec.urdf_path)
+        urdf = spec.urdf
         self.joint_names = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")
         self._positions = np.array([model.joint(name).qposadr[0] for name in self.joint_names])
         self._velocities = np.array([model.joint(name).dofadr[0] for name in self.joint_names])
@@ -39,7 +54,7 @@ class MujocoScene(Scene):
         self._map_contacts()
         data.qpos[self._positions] = [spec.joints[name] for name in self.joint_names]
         self.drive(data.qpos[self._positions])
-        for slide in mount_slides(spec):
+        for slide in spec.slides:
             data.qpos[model.joint(slide.name).qposadr[0]] = slide.start
             self._move_mount(slide.name, slide.start, 0.0)
         mujoco.mj_step1(model, data)
@@ -135,3 +150,132 @@ def _import_mujoco() -> Any:
     if engine.get_mju_user_warning() is None:
         engine.set_mju_user_warning(lambda text: None)
     return engine
+
+
+def scene_mjcf(spec: SceneSpec) -> str:
+    """Return a scene as XML, all joints at zero.
+
+    Actuators are positional and named like their joints.
+
+    Raises:
+        BadArgument: a joint of the hand without a position or drive.
+        HandFileError: the URDF is not valid (`read_urdf`).
+    """
+    urdf = spec.urdf
+    movable = [joint.name for joint in urdf.joints if joint.kind != "fixed"]
+    spec.check_drives(movable)
+    root = ET.Element("mujoco", model="torchgrasp")
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
+    option = ET.SubElement(root, "option", OPTION, timestep=repr(spec.timestep), gravity=f"0 0 {-spec.gravity!r}")
+    ET.SubElement(option, "flag", multiccd="enable", autoreset="disable")
+    default = ET.SubElement(root, "default")
+    friction = format_numbers((spec.friction, spec.friction * spec.patch, 0.0))
+    condim = "4" if spec.patch > 0 else "3"
+    ET.SubElement(default, "geom", friction=friction, condim=condim, solref=SOLREF, solimp=SOLIMP)
+    ET.SubElement(default, "joint", solreflimit=SOLREF)
+    ET.SubElement(default, "mesh", inertia="shell")
+    asset, world, actuator = (ET.SubElement(root, tag) for tag in ("asset", "worldbody", "actuator"))
+    if spec.table:
+        bits = _bits(TABLE_BIT, HAND_BIT)
+        height = format_numbers((0.0, 0.0, spec.table_height))
+        ET.SubElement(world, "geom", bits, name=TABLE, type="plane", size="1 1 0.1", pos=height)
+    _add_body(asset, world, OBJECT, spec.body, HAND_BIT | TABLE_BIT)
+    for k, body in enumerate(spec.neighbours):
+        _add_body(asset, world, NEIGHBOUR.format(k), body, HAND_BIT | TABLE_BIT | OBJECT_BIT)
+    _add_hand(world, spec, urdf)
+    for name in movable:
+        add_drive(actuator, name, spec.drives[name])
+    for slide in spec.slides:
+        add_drive(actuator, slide.name, MOUNT_DRIVE)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _add_body(asset: ET.Element, world: ET.Element, name: str, spec: Body, hits: int) -> None:
+    """Add a free body with the mass centre and inertia of an even filling, and the groups that it hits."""
+    body = ET.SubElement(world, "body", name=name)
+    ET.SubElement(body, "freejoint", name=name)
+    _weigh(body, spec.mass, spec.mesh.center_mass, spec.inertia[np.triu_indices(3)])
+    for k, part in enumerate(spec.parts):
+        corners = format_numbers(np.asarray(part.vertices, float).ravel())
+        ET.SubElement(asset, "mesh", name=f"{name}_{k}", vertex=corners)
+        ET.SubElement(body, "geom", _bits(OBJECT_BIT, hits), type="mesh", mesh=f"{name}_{k}")
+
+
+def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:
+    """Add the hand on its mount."""
+    mount = world
+    for slide in spec.slides:
+        mount = ET.SubElement(mount, "body", name=slide.name, gravcomp="1")
+        _weigh(mount, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
+        limits = {"axis": format_numbers(slide.axis), "range": format_numbers((slide.lower, slide.upper))}
+        ET.SubElement(mount, "joint", limits, name=slide.name, type="slide")
+    add_links(mount, urdf, spec.world_from_hand, pair_masks(spec.self_pairs, FREE_BIT))
+
+
+def add_links(
+    parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray, masks: Mapping[str, tuple[int, int]] | None = None
+) -> ET.Element:
+    """Add the links of a hand to a body; return the root's body. `masks` are those of `pair_masks`."""
+    masks = masks or {}
+    links = {link.name: link for link in urdf.links}
+    root = _add_link(parent, links[urdf.root], parent_from_root[:3, 3], parent_from_root[:3, :3], masks)
+    bodies = {urdf.root: root}
+    while len(bodies) < len(links):
+        for joint in urdf.joints:
+            if joint.parent in bodies and joint.child not in bodies:
+                body = _add_link(bodies[joint.parent], links[joint.child], joint.xyz, _rotation(joint.rpy), masks)
+                bodies[joint.child] = body
+                if joint.kind != "fixed":
+                    kind = "slide" if joint.kind == "prismatic" else "hinge"
+                    limits = {"axis": format_numbers(joint.axis), "range": format_numbers((joint.lower, joint.upper))}
+                    ET.SubElement(body, "joint", limits, name=joint.name, type=kind, armature=repr(ARMATURE))
+    return root
+
+
+def _add_link(
+    parent: ET.Element, link: Link, place: Iterable[float], rotation: np.ndarray, masks: Mapping[str, tuple[int, int]]
+) -> ET.Element:
+    """Add a link of the hand with its shapes."""
+    body = ET.SubElement(parent, "body", _frame(place, rotation), name=link.name, gravcomp="1")
+    if link.mass > 0:
+        _weigh(body, link.mass, link.com, link.inertia)
+    kind, hits = masks.get(link.name, (0, 0))
+    for shape in link.shapes:
+        halves = {"box": (0.5, 0.5, 0.5), "sphere": (1.0,), "cylinder": (1.0, 0.5)}[shape.kind]
+        size = format_numbers(np.multiply(shape.size, halves))
+        frame = _frame(shape.xyz, _rotation(shape.rpy))
+        ET.SubElement(body, "geom", _bits(HAND_BIT | kind, hits) | frame, type=shape.kind, size=size)
+    return body
+
+
+def add_drive(actuator: ET.Element, joint: str, drive: Actuator) -> None:
+    """Add a motor of torque kp (target - q) - kd dq/dt, limited to the effort."""
+    gains = {"kp": repr(drive.kp), "kv": repr(drive.kd), "forcerange": format_numbers((-drive.effort, drive.effort))}
+    ET.SubElement(actuator, "position", gains, name=joint, joint=joint)
+
+
+def _weigh(body: ET.Element, mass: float, centre: Iterable[float], inertia: Iterable[float]) -> None:
+    """Set a body's mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m^2]."""
+    xx, xy, xz, yy, yz, zz = inertia
+    tensor = format_numbers((xx, yy, zz, xy, xz, yz))
+    ET.SubElement(body, "inertial", mass=repr(float(mass)), pos=format_numbers(centre), fullinertia=tensor)
+
+
+def _bits(kind: int, others: int) -> dict[str, str]:
+    """Return a shape's collision group and the groups it hits."""
+    return {"contype": str(kind), "conaffinity": str(others)}
+
+
+def _frame(place: Iterable[float], rotation: np.ndarray) -> dict[str, str]:
+    """Return a pose as attributes: position and the first two axes."""
+    return {"pos": format_numbers(place), "xyaxes": format_numbers(rotation[:, :2].T.ravel())}
+
+
+def _rotation(rpy: tuple[float, float, float]) -> np.ndarray:
+    """Return the rotation matrix (3, 3) of a URDF's angles."""
+    return rotation_from_rpy(rpy).numpy()
+
+
+def format_numbers(numbers: Iterable[float]) -> str:
+    """Return numbers as the text of an attribute, without loss."""
+    return " ".join(repr(float(x)) for x in numbers)

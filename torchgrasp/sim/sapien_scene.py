@@ -29,7 +29,6 @@ from torchgrasp.sim.scene_spec import (
     WRIST_JOINT,
     Body,
     SceneSpec,
-    mount_slides,
     mounted_urdf,
     pair_masks,
 )
@@ -117,7 +116,7 @@ def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
     with temporary_folder() as folder:
         hand = loader.load(str(write_file(folder / "hand.urdf", mounted_urdf(spec))))
-    slides = {slide.name: slide for slide in mount_slides(spec)}
+    slides = {slide.name: slide for slide in spec.slides}
     spec.check_drives([j.name for j in hand.active_joints if j.name not in slides])
     start = []
     for joint in hand.active_joints:

@@ -1,6 +1,7 @@
 """Parameters of a simulated scene: table, object, neighbours, and a hand on a mount."""
 
 import dataclasses
+import functools
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
@@ -13,7 +14,7 @@ import numpy as np
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
-from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.hand.urdf import Urdf, read_urdf
 
 if TYPE_CHECKING:
     import trimesh
@@ -117,6 +118,25 @@ class SceneSpec:
     self_pairs: tuple[tuple[str, str], ...] = ()
     yields: float = 0.0
 
+    @functools.cached_property
+    def urdf(self) -> Urdf:
+        """The hand; raises `HandFileError` for a file that is not a valid URDF."""
+        return read_urdf(self.urdf_path)
+
+    @functools.cached_property
+    def slides(self) -> list["Slide"]:
+        """Return the joints of the mount, from the world to the hand."""
+        slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, self.travel + 0.05, 0.0)]
+        length = float(np.linalg.norm(self.approach))
+        if length > 0:
+            x, y, z = self.approach
+            axis = (x / length, y / length, z / length)
+            slides.append(Slide(APPROACH_JOINT, axis, -length - 0.01, 0.01, -length))
+        if self.yields > 0:
+            most, axes = self.yields + 0.01, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+            slides += [Slide(name, axis, -most, most, 0.0) for name, axis in zip(SHIFT_JOINTS, axes, strict=True)]
+        return slides
+
     @property
     def body(self) -> Body:
         """The object as a body."""
@@ -151,20 +171,6 @@ class Slide(NamedTuple):
     start: float
 
 
-def mount_slides(spec: SceneSpec) -> list[Slide]:
-    """Return the joints of the mount, from the world to the hand."""
-    slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, spec.travel + 0.05, 0.0)]
-    length = float(np.linalg.norm(spec.approach))
-    if length > 0:
-        x, y, z = spec.approach
-        axis = (x / length, y / length, z / length)
-        slides.append(Slide(APPROACH_JOINT, axis, -length - 0.01, 0.01, -length))
-    if spec.yields > 0:
-        most, axes = spec.yields + 0.01, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-        slides += [Slide(name, axis, -most, most, 0.0) for name, axis in zip(SHIFT_JOINTS, axes, strict=True)]
-    return slides
-
-
 def mounted_urdf(spec: SceneSpec) -> str:
     """Return the URDF of the hand on its mount.
 
@@ -174,7 +180,7 @@ def mounted_urdf(spec: SceneSpec) -> str:
     Raises:
         HandFileError: the file is not a valid URDF (`read_urdf`).
     """
-    urdf = read_urdf(spec.urdf_path)
+    urdf = spec.urdf
     robot = ET.fromstring(urdf.xml)
     for joint in robot.iter("joint"):
         for mimic in joint.findall("mimic"):
@@ -182,7 +188,7 @@ def mounted_urdf(spec: SceneSpec) -> str:
     roll, pitch, yaw = euler_from_rotation(spec.world_from_hand[:3, :3])
     x, y, z = spec.world_from_hand[:3, 3]
     mount, parent = ['<link name="torchgrasp_world"/>'], "torchgrasp_world"
-    for slide in mount_slides(spec):
+    for slide in spec.slides:
         child = f"{slide.name}_link"
         mount.append(
             f"""<link name="{child}"><inertial><origin xyz="0 0 0"/><mass value="1"/>
