@@ -1,5 +1,6 @@
 """Hostile folders of objects: names never leave the folder, and one bad entry costs its own object alone."""
 
+import dataclasses
 import json
 import math
 import os
@@ -15,8 +16,9 @@ from torchgrasp import PointCloud
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data import list_entries, list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, CloudFileError, DatasetError, MeshError, Status
-from torchgrasp.evaluation import EvaluationSpec, evaluate
+from torchgrasp.evaluation import EvaluationSpec, Protocol, evaluate
 from torchgrasp.hand.load import load_hand
+from torchgrasp.specs import TrialSpec
 
 POSE = [[1.0, 0.0, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
 GOOD = {"views": {"v0": {"T_object_camera": POSE}}}
@@ -168,11 +170,11 @@ def test_two_names_never_share_a_file_of_grasps(tmp_path: Path):
     put(objects / "a", 0.06, "b_c"), put(objects / "a_b", 0.05, "c")
     view = GOOD["views"]["v0"]
     write(objects, {"a": {"views": {"b_c": view}}, "a_b": {"views": {"c": view}}})
-    spec = EvaluationSpec(1, starts=60)
-    scores = list(evaluate(objects, load_hand("allegro"), spec=spec, folder=tmp_path / "grasps"))
+    test, spec = Protocol("quick", TrialSpec(hold_time=0.0)), EvaluationSpec(1, starts=30)
+    scores = list(evaluate(objects, load_hand("allegro"), test, spec, folder=tmp_path / "grasps"))
     written = sorted(str(x.relative_to(tmp_path / "grasps")) for x in (tmp_path / "grasps").rglob("*.safetensors"))
     assert written == ["a/b_c.safetensors", "a_b/c.safetensors"]
-    alone = list(evaluate(objects, load_hand("allegro"), spec=EvaluationSpec(1, starts=60, only=("a",))))
+    alone = list(evaluate(objects, load_hand("allegro"), test, dataclasses.replace(spec, only=("a",))))
     assert [a.moved for a in alone[0].attempts] == [a.moved for a in scores[0].attempts]
 
 
