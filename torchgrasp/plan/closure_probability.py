@@ -174,9 +174,6 @@ def first_contact(
     return lines.points[:, None] + motion * lines.normals[:, None], unit((weights @ slope)[..., 0, :])
 
 
-GPU_DRAWS = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
-
-
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
@@ -240,6 +237,7 @@ def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
     """Return the share of n drawn surfaces on which the fingers' contacts are closed."""
     draws_per_chunk = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
+    gpu_draws = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))
     guess = None if lines.points.shape[1] == 3 else first_balance(lines.points, lines.normals, friction)
