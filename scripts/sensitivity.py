@@ -14,8 +14,10 @@ import importlib.machinery
 import importlib.util
 import json
 import multiprocessing
+import re
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +27,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PLANNED = ("geometry", "cloud", "scene", "shape", "plan", "ik", "planner", "posture_model", "hand")
 CLOSED = ("control", "sim", "evaluation")
 """Folders whose numbers act on plans, and on closings."""
+SENSITIVITY = """Each number at module level is moved by 20 %, up and then down, on plans, a scene and closings.
+A number without effect here is a tolerance, a bound of memory or of a file, or serves a case that is not here."""
 
 
 class Number(NamedTuple):
@@ -194,6 +198,7 @@ def main() -> int:
     parser.add_argument("--names", nargs="*", default=[], help="objects of the folder that are planned on")
     parser.add_argument("--folders", nargs="*", default=[*PLANNED, *CLOSED], help="folders whose numbers are moved")
     parser.add_argument("--out", type=Path, required=True, help="JSON file; numbers that it holds are not tried again")
+    parser.add_argument("--publish", action="store_true", help="write docs/results/sensitivity.md, too")
     given = parser.parse_args()
     import lxml.etree  # noqa: F401
     import mujoco  # noqa: F401
@@ -216,7 +221,32 @@ def main() -> int:
             print(f"{done[key]:28} {key}", flush=True)
             given.out.write_text(json.dumps(done, indent=1))
     print(f"{sum(value == 'no effect' for value in done.values())} of {len(done)} numbers have no effect")
+    if given.publish:
+        write_page(done)
     return 0
+
+
+def write_page(done: dict[str, str]) -> None:
+    """Write docs/results/sensitivity.md: how many numbers have an effect, and the others with their reason."""
+    from benchmarks.common import describe_run
+
+    found = [(*re.fullmatch(r"torchgrasp\.(\S+):(\d+) (.+) \[\d+\]", key).groups(), done[key]) for key in done]  # pyright: ignore
+    silent = [(module, int(line), name) for module, line, name, effect in found if effect == "no effect"]
+    every, without = Counter(x[0].split(".")[0] for x in found), Counter(x[0].split(".")[0] for x in silent)
+    lines = ["# Numbers", "", "`scripts/sensitivity.py`", "", describe_run(1), "", SENSITIVITY, ""]
+    lines += ["| folder | numbers | without effect |", "| --- | --- | --- |"]
+    lines += [f"| {folder} | {n} | {without[folder]} |" for folder, n in sorted(every.items())]
+    lines += ["", "| number without effect | its reason |", "| --- | --- |"]
+    lines += [f"| `{module}.{name}` | {reason_of(module, line)} |" for module, line, name in silent]
+    (ROOT / "docs" / "results" / "sensitivity.md").write_text("\n".join(lines) + "\n")
+
+
+def reason_of(module: str, line: int) -> str:
+    """Return the comment behind the number at a line, or the docstring below it."""
+    path = ROOT / "torchgrasp" / Path(*module.split("."))
+    source = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text().split("\n")
+    _, mark, comment = source[line - 1].partition("  # ")
+    return (comment if mark else source[line].strip('"')).replace("|", "/")
 
 
 if __name__ == "__main__":
