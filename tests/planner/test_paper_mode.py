@@ -18,7 +18,7 @@ def run():
     stages = {}
     hand, view = load_hand("allegro"), load_object("jug").view
     note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
-    return hand, plan_grasps(view, hand, SPEC, starts=80, mode="paper", observer=note), stages
+    return hand, plan_grasps(view, hand, SPEC, starts=40, mode="paper", observer=note), stages
 
 
 def test_shape_contacts_and_ranking_are_the_papers(run):
