@@ -152,6 +152,6 @@ def _long_text(field: Field) -> str:
 
 
 def short(text: str) -> str:
-    """Return a text as it is kept in a row: on one line, cut to what its reader takes."""
+    """Return a text on one line, cut to the length that a reader of rows accepts."""
     line = " ".join(text.split())
     return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."

@@ -244,7 +244,7 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
 
 def _rank(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return each seed's rank within its triple by its deepest collision, the least first."""
+    """Return the rank of each seed among the seeds of its triple, by the depth of the deepest collision."""
     contacts, still = assign(problem.contacts, seeds), np.zeros(problem.hand.dof)
     runs = [CobylaRun(problem.hand, q, p, problem.world) for q, p in zip(seeds.joints, contacts.points, strict=True)]
     deepest = [max(0.0, -float(run.evaluate(still)[1].min())) for run in runs]

@@ -53,7 +53,7 @@ def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the largest tangent between an inward normal and the line to the contacts' centre."""
+    """Return the friction that forces towards the centre of the contacts need: the largest over the contacts."""
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
     sine = torch.linalg.vector_norm(torch.linalg.cross(inward, contacts.normals), dim=-1)

@@ -170,7 +170,7 @@ def nearest_postures(
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
 ) -> tuple[Float[Tensor, "r p 4 4"], Float[Tensor, "r p d"]]:
-    """Return frames and features of contacts in every assignment; they are arbitrary if it is not `framed`."""
+    """Return virtual frame and features of the contacts in each assignment; arbitrary where not `framed`."""
     stand_in = torch.eye(3, dtype=centres.dtype, device=centres.device)
     triangle = torch.where(framed[..., None, None], triangle_of(centres), stand_in)
     obj_from_vf = rigid(virtual_frame(triangle)[..., :3, :3], centres.mean(-2))

@@ -76,7 +76,7 @@ def _hands(request: Request) -> Iterator[Change]:
 
 
 def _limits(request: Request) -> Iterator[Change]:
-    """Yield wider limits of contacts: the default, or a limit beyond it."""
+    """Yield changes that relax one limit of the contacts: to its default, or beyond the default."""
     spec, tips = request.contact_spec, float(request.hand.tips.radius.max())
     own = spec.for_fingertips(tips)
     if (wider := _next((0.03, 0.1), spec.max_variance)) is not None:

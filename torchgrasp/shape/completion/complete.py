@@ -44,10 +44,10 @@ Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "
 
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
-    """Points of the hidden side. Their errors across the surface are correlated and do not average out.
+    """Points of the hidden side, with normals. Errors of nearby points are correlated: they do not average out.
 
-    The covariance is LEAST_NOISE^2 I + deviations deviations^T [m^2]. The deviations are errors of the planes and a
-    smooth field of length scale `PART`, the asymmetry.
+    The errors along the normals have the covariance LEAST_NOISE^2 I + D D^T [m^2]. The columns of D (`deviations`) are
+    errors of the mirror planes, and a smooth field of length scale `PART`, the asymmetry of the object.
 
     Args:
         shared: standard deviations [m] of the errors by plane.

@@ -48,7 +48,7 @@ class SymmetryScorer:
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
-        """Return the scorer of a cloud with normals, all of it probed; the table has normal z."""
+        """Return the scorer of a cloud with normals; all points are probes. `table` is the height [m] of the table."""
         from scipy.spatial import KDTree
 
         assert cloud.normals is not None
