@@ -264,7 +264,14 @@ def test_scene_is_that_of_the_depth_image(tmp_path, capsys):
     found, said = read_scene(tmp_path / "s.npz"), capsys.readouterr().out
     assert len(found.things) == len(load_scene().things) == said.count("object ") and found.target is None
     assert found.table is not None and abs(found.table.offset) < 0.002  # the shipped scene stands at z = 0
-    np.save(tmp_path / "mask.npy", load_scene().image.depth.numpy() < 0)
+    shipped, on_target = load_scene(), np.zeros(tuple(image.depth.shape), dtype=bool)
+    on_target[tuple(shipped.pixels[shipped.rows_of(2)].T.numpy())] = True
+    np.save(tmp_path / "mask.npy", on_target)
+    assert cli.main([*words, "--camera-pose", str(tmp_path / "pose.txt"), "--mask", str(tmp_path / "mask.npy")]) == 0
+    chosen = read_scene(tmp_path / "s.npz")  # the object that was announced is still the target
+    assert f"object {chosen.target}:" in capsys.readouterr().out.split("(the target)")[0]
+    assert float(torch.cdist(chosen.cloud().points, shipped.cloud(2).points).amin(1).quantile(0.9)) < 0.002
+    np.save(tmp_path / "mask.npy", shipped.image.depth.numpy() < 0)
     assert cli.main([*words, "--mask", str(tmp_path / "mask.npy")]) == 2
     assert "--mask" in capsys.readouterr().err
 

@@ -18,6 +18,21 @@ def test_a_saved_scene_comes_back(tmp_path):
     assert is_scene(tmp_path / "scene.npz")
 
 
+def test_the_target_of_a_saved_scene_comes_back(tmp_path):
+    scene = load_scene()
+    for target in (None, 3, scene.things[0]):
+        chosen = scene if target is None else scene.select(target)
+        assert read_scene(save_scene(chosen, tmp_path / "scene.npz")).target == target
+
+
+@pytest.mark.parametrize(("target", "error"), [(7, BadArgument), (2.5, CloudFileError), ([1, 2], CloudFileError)])
+def test_a_target_that_is_no_label_is_refused(tmp_path, target, error):
+    path = save_scene(load_scene(), tmp_path / "scene.npz")
+    np.savez(path, **dict(np.load(path)) | {"target": np.array(target)})
+    with pytest.raises(error):
+        read_scene(path)
+
+
 def test_the_shipped_scene_stands_on_its_table():
     scene = load_scene()
     assert scene.things == (1, 2, 3, 4) and scene.advice == ()

@@ -134,12 +134,12 @@ def image_of_cloud(
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a scene's .npz file; the table as 4 floats.
+    """Return the arrays of a scene's .npz file; the table as 4 floats, the target as a whole number.
 
     Raises:
         CloudFileError: no such file, or malformed content.
     """
-    names = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table")  # the first two are required
+    names = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table", "target")  # the first two are required
     allowed = "a .npz file with depth and intrinsics"
     if path.suffix.lower() != ".npz" or not is_file(path):
         raise CloudFileError("path", path, allowed)
@@ -150,6 +150,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         found = {name: arrays[name] for name in ("depth", "intrinsics")} | arrays
         if "table" in found:
             found["table"] = found["table"].astype(float).reshape(4)
+        if "target" in found:
+            found["target"] = found["target"].astype(np.int64, casting="safe").reshape(())
     except BadArgument:
         raise
     except Exception as error:  # zlib, zipfile and numpy each raise their own

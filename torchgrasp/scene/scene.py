@@ -250,8 +250,8 @@ def read_scene(path: Path | str) -> Scene:
     """Read a scene from a .npz file, as `Scene.from_depth` does.
 
     Its arrays are `depth` (h, w) in metres or integer millimetres, `intrinsics` (3, 3) or (4,), and optionally
-    `camera_pose` (4, 4), `labels` (h, w) of objects or `mask` (h, w) of the target, and `table` (4,): normal and
-    offset.
+    `camera_pose` (4, 4), `labels` (h, w) of objects or `mask` (h, w) of the target, `target`, a label, and `table`
+    (4,): normal and offset.
 
     Raises:
         CloudFileError: no such file, or malformed content.
@@ -263,14 +263,15 @@ def read_scene(path: Path | str) -> Scene:
     (1, 2, 3, 4)
     """
     arrays = read_arrays(Path(path))
-    table, pose = arrays.pop("table", None), arrays.pop("camera_pose", None)
+    table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
     plane = None if table is None else Plane(torch.tensor(table[:3]), float(table[3]))
-    return Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
+    scene = Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
+    return scene if target is None else scene.select(int(target))
 
 
 @checked
 def save_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a scene as .npz, atomically: depth in float32, labels, camera and table; `read_scene` reads it.
+    """Write a scene as .npz, atomically: depth in float32, labels, camera, table and target; `read_scene` reads it.
 
     Raises:
         BadArgument: another suffix.
@@ -295,5 +296,7 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
     }
     if scene.table is not None:
         arrays["table"] = np.array([*scene.table.normal.tolist(), scene.table.offset])
+    if scene.target is not None:
+        arrays["target"] = np.array(scene.target)
     np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
     return write_file(path, buffer.getvalue())
