@@ -14,7 +14,7 @@ from torchgrasp.plan.closure import wrenches
 from torchgrasp.plan.feasibility import check_feasibility, first_violation, normal_variation
 from torchgrasp.plan.solve import TO_CENTRE, plan_chunk, plan_contacts
 from torchgrasp.plan.solver import project
-from torchgrasp.plan.starts import draw_in, drawn_starts, settle_flatness
+from torchgrasp.plan.starts import STARTS_PER_CHUNK, chunk_sizes, draw_in, drawn_starts, settle_flatness
 from torchgrasp.specs import ContactSpec
 
 SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, flatness=0.6, flat_radius=0.008)}
@@ -127,6 +127,12 @@ def test_more_starts_only_add_rows(ellipsoid, monkeypatch):
     for spec in SPECS.values():
         few, many = (plan_contacts(ellipsoid, spec, starts=count) for count in (10, 15))
         torch.testing.assert_close(few.contacts.points, many.contacts.points[:10])
+
+
+def test_chunks_hold_all_starts_and_no_more():
+    for count in (0, 1, 499, 500, 501, 1700):
+        sizes = chunk_sizes(count)
+        assert sum(sizes) == count and all(0 < size <= STARTS_PER_CHUNK for size in sizes)
 
 
 def test_far_starts_are_drawn_in_and_those_on_the_surface_stay(ellipsoid, generator):
