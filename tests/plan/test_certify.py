@@ -15,7 +15,7 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan import closure
 from torchgrasp.plan.certify import bound_margin, certify
-from torchgrasp.plan.closure import wrenches
+from torchgrasp.plan.closure import solve_closure_lp, wrenches
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts
 
@@ -207,3 +207,8 @@ def test_certify_accepts_no_balance_with_a_residual(monkeypatch, residual, close
     monkeypatch.setattr(module, "EXACT", -1.0)  # every row is given to HiGHS
     monkeypatch.setattr(module, "solve_by_highs", lambda wrench: (0.01, residual, None))
     assert bool(certify(Contacts(points, points), SPEC).closed) is closed
+
+
+def test_the_programme_of_no_grasps_is_empty():
+    phi, witness = solve_closure_lp(torch.zeros(0, 24, 6, dtype=torch.float64))
+    assert phi.shape == (0, 24) and witness.shape == (0, 6)
