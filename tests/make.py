@@ -11,13 +11,14 @@ import torch
 import trimesh
 from torch import Tensor
 
-from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.closure import closed_exact
 from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.scene import Scene
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.kernel import Kernel, Profile, cross_covariance
@@ -165,3 +166,15 @@ def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": path}
     command = [sys.executable, *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, env=environment)
+
+
+def see(*boxes: tuple[float, ...], pose: Tensor | None = None) -> Scene:
+    """Return the scene of boxes (x, y, width, height) on the table, or (x, y, width, height, foot)."""
+    meshes = []
+    for x, y, width, height, *foot in boxes:
+        mesh = trimesh.creation.box([width, width, height])
+        mesh.apply_translation([x, y, height / 2 + (foot[0] if foot else 0.0)])
+        meshes.append(mesh)
+    camera = look_at(20.0, 45.0, 0.7)
+    depth, labels = render_depth(meshes, camera)
+    return Scene.from_depth(depth, INTRINSICS, camera if pose is None else pose @ camera, labels=labels)

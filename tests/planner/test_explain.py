@@ -8,6 +8,7 @@ import torch
 import trimesh
 
 import torchgrasp
+from tests.make import see
 from torchgrasp import ContactSpec, PointCloud, Status, explain_empty, load_object, plan_grasps
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.errors import BadArgument
@@ -151,6 +152,20 @@ def test_a_disc_too_low_for_fingertips_needs_its_table_gone(first_only):
     assert heard == [("change", str(explanation.best), explanation.best)]
     assert Status.BELOW_TABLE in explanation.funnel.stages[0].lost
     assert explanation.best is not None and "no table" in explanation.best.words and not explanation.best.choice
+
+
+def test_fingers_without_a_thumb_are_told_to_take_it(monkeypatch):
+    monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 2)
+    explanation = explain_empty(VIEW, load_hand("allegro", "paper_literal"), TABLE, starts=8, seed=1)
+    assert explanation.funnel.executable == 0 and explanation.best is not None
+    assert "fingers='default' (index, middle, thumb)" in explanation.best.words and explanation.best.choice
+    assert str(explanation.best) in str(explanation) and "tip_error" in str(explanation)
+
+
+def test_an_object_under_another_asks_to_take_the_other_first(first_only):
+    scene = see((0.0, 0.0, 0.09, 0.06), (0.0, 0.0, 0.07, 0.05, 0.06)).select(1)
+    explanation = explain_empty(scene, load_hand("barrett"), starts=8)
+    assert explanation.best is not None and "taken away first" in explanation.best.words
 
 
 @pytest.fixture

@@ -4,30 +4,16 @@ import dataclasses
 
 import pytest
 import torch
-import trimesh
 
+from tests.make import see
 from torchgrasp import ContactSpec, Status, load_hand, load_scene, plan_grasps, plan_scene
-from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.planner.problem import TARGET_POINTS, take_target
 from torchgrasp.planner.scene import order_by_ease
-from torchgrasp.scene import Scene
 
 HAND = load_hand("barrett")
-
-
-def see(*boxes: tuple[float, ...], pose: torch.Tensor | None = None) -> Scene:
-    """Return the scene of boxes (x, y, width, height) on the table, or (x, y, width, height, foot)."""
-    meshes = []
-    for x, y, width, height, *foot in boxes:
-        mesh = trimesh.creation.box([width, width, height])
-        mesh.apply_translation([x, y, height / 2 + (foot[0] if foot else 0.0)])
-        meshes.append(mesh)
-    camera = look_at(20.0, 45.0, 0.7)
-    depth, labels = render_depth(meshes, camera)
-    return Scene.from_depth(depth, INTRINSICS, camera if pose is None else pose @ camera, labels=labels)
 
 
 def test_room_and_height_are_easy_and_what_something_lies_on_is_not():
