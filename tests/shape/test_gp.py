@@ -134,6 +134,14 @@ def test_jet_equals_predict_and_its_gradients_equal_finite_differences(half_ball
         torch.testing.assert_close(jet.variance_gradient[:, m], wider / (60 * step), rtol=1e-3, atol=1e-3)
 
 
+def test_normal_jacobian_equals_finite_differences(half_ball: ShapeGP):
+    x, h = _queries(half_ball, 8), 1e-5
+    steps = h * torch.eye(3, dtype=torch.float64)
+    ends = [(half_ball.mean_jet(x + step).normals, half_ball.mean_jet(x - step).normals) for step in steps]
+    numeric = torch.stack([(ahead - behind) / (2 * h) for ahead, behind in ends], -1)
+    torch.testing.assert_close(half_ball.mean_jet(x).normal_jacobian, numeric, atol=1e-6, rtol=1e-5)
+
+
 def test_jet_is_finite_at_the_observations_and_for_no_points(half_ball: ShapeGP):
     jet = half_ball.jet(half_ball.x)
     assert all(torch.isfinite(t).all() for t in (jet.distance, jet.gradient, jet.hessian, jet.variance_gradient))
