@@ -171,6 +171,9 @@ def test_grip_floors_stay_finite_for_a_planned_force_along_the_surface(sideways,
     seen = observation(0.0, (2.0, 2.0, 4.0), TOUCHING)
     tactile = dataclasses.replace(seen.tactile, normals=normals, points=points)
     known, seen = dataclasses.replace(reference(), max_force=max_force), dataclasses.replace(seen, tactile=tactile)
-    floor = GripHold(known, seen, torch.zeros(9).double())._floor()
+    hold = GripHold(known, seen, torch.zeros(9).double())
+    hold.load = np.array([2.0, 3.0, 6.0, 9.0, 9.0, 9.0])  # force [N] and torque [N m]
+    assert hold.weight == pytest.approx(7.0)
+    floor = hold._floor()
     assert np.isfinite(floor).all() and (floor > 0).all()
     assert max_force is not None or (floor >= MIN_PUSH).all()

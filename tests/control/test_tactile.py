@@ -63,6 +63,7 @@ def test_measure_noise_of_forces_has_the_papers_size_and_no_bias():
     rest = last.forces - press(2.0).forces
     along = (rest * NORMALS).sum(-1)
     assert torch.allclose(along, -(last.reading - 2.0), atol=1e-5)  # both readings have the same noise
+    assert float(last.sliding.std()) == pytest.approx(2e-3, rel=0.03)  # [m/s]; nothing slides
     across = (rest - along[..., None] * NORMALS).norm(dim=-1)
     assert float(across.square().mean().sqrt()) == pytest.approx(2**0.5 * 0.3, rel=0.03)
 

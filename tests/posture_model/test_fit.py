@@ -78,6 +78,7 @@ def test_the_likeliest_of_several_starts_goes_on():
     assert torch.equal(together.covariances, best.covariances)
     # The steps of the trial count, and more follow.
     assert together.meta["iterations"] == str(TRIAL_STEPS)
+    assert fit_mixture(samples, 6, iterations=1).meta["iterations"] == "1"
     assert fit_mixture(samples, 6, seed=2, iterations=30, tolerance=0.0, starts=3).meta["iterations"] == "30"
 
 

@@ -78,6 +78,10 @@ def test_a_judgement_is_what_it_says():
     torch.testing.assert_close(result.error, error.mean(0))
     torch.testing.assert_close(result.deviation, error.std(0))
     assert math.isclose(result.mean_error, float(error.mean()))
+    modes = mixture.modes(held_out.q, 4)[0]
+    pairs = zip(modes, held_out.joints, strict=True)
+    off = [min(float((mode - joints).abs().mean()) for mode in found) for found, joints in pairs]
+    assert math.isclose(result.nearest_mode, sum(off) / len(off), rel_tol=1e-9)
     accepted = [float((mixture.energy(held_out.q) < r).double().mean()) for r in (PAPER_ENERGY, DEFAULT_ENERGY)]
     assert [result.paper_coverage, result.default_coverage] == accepted
     assert result.meta()["acceptance_paper_coverage"] == f"{accepted[0]:.4f}"

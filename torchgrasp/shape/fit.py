@@ -4,6 +4,7 @@ import dataclasses
 import math
 import sys
 import warnings
+from types import FrameType
 from typing import Annotated, Literal
 
 import torch
@@ -223,7 +224,8 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
 
 def _warn(kind: type[Warning], sentence: str) -> None:
     """Show a warning at the first caller outside of the library."""
-    level, frame = 2, sys._getframe(1)
-    while frame.f_back is not None and frame.f_back.f_globals.get("__name__", "").startswith("torchgrasp."):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(sentence, kind, stacklevel=level)
+    frames: list[FrameType] = [frame := sys._getframe()]
+    while (frame := frame.f_back) is not None:
+        frames.append(frame)
+    own = [level for level, x in enumerate(frames, 1) if x.f_globals.get("__name__", "").startswith("torchgrasp.")]
+    warnings.warn(sentence, kind, stacklevel=own[-1] + 1)

@@ -2,7 +2,11 @@
 
 import dataclasses
 import math
+import os
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +17,8 @@ from torchgrasp.cloud import look_at, partial_view
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.errors import CutOff, Gap, TwoBodies
 from torchgrasp.shape.fit import fit_shape
+
+PATH = {"PYTHONPATH": str(Path(__file__).parents[3])}
 
 
 def on_table(mesh):
@@ -93,6 +99,21 @@ def test_a_hole_that_is_seen_through_is_no_surface():
         shape = fit_shape(partial_view(ring, look_at(30.0, 60.0, target=ring), n=1000), table=0.0)
     middle = shape.predict(torch.tensor([[0.0, 0.0, 0.012], [0.01, 0.0, 0.012]], dtype=torch.float64))
     assert bool((middle.distance * shape.scale > 0.01).all())
+
+
+def test_a_warning_names_the_line_of_the_caller(tmp_path):
+    """In a process of its own: here the checks of annotations stand between caller and library."""
+    lines = [
+        "import torch",
+        "from torchgrasp import PointCloud, fit_shape, load_object",
+        "view = load_object('cylinder').view",
+        "both = torch.cat([view.points, view.points + torch.tensor([0.0, 0.25, 0.0])])",
+        "fit_shape(PointCloud(both, viewpoint=view.viewpoint), table=0.0)",
+    ]
+    script = tmp_path / "script.py"
+    script.write_text("\n".join(lines))
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=os.environ | PATH)
+    assert f"{script}:5: TwoBodies: two bodies" in done.stderr
 
 
 def test_two_bodies_are_told():
