@@ -111,8 +111,6 @@ def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m
         wrench: the primitive wrenches, float64.
     """
     parts = [_solve(w) for w in wrench.split(GRASPS_PER_CHUNK)]
-    if not parts:
-        return wrench.new_zeros(wrench.shape[:2]), wrench.new_zeros(len(wrench), 6)
     phi, witness = (torch.cat(part) for part in zip(*parts, strict=True))
     return phi, witness
 
