@@ -13,7 +13,6 @@ from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.mujoco_scene import OBJECT
-from torchgrasp.sim.scene import open_scene
 from torchgrasp.sim.scene_spec import (
     APPROACH_JOINT,
     LIFT_JOINT,
@@ -22,6 +21,7 @@ from torchgrasp.sim.scene_spec import (
     euler_from_rotation,
     mounted_urdf,
 )
+from torchgrasp.sim.simulators import open_scene
 
 
 def test_euler_angles_rebuild_the_rotation():

@@ -12,8 +12,8 @@ from tests.pinch import QUICK, close, cylinder, pinch
 from torchgrasp.errors import HandFileError, Status
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
 from torchgrasp.hand.load import load_hand
-from torchgrasp.sim.scene import open_scene
 from torchgrasp.sim.scene_spec import SceneSpec, pair_masks
+from torchgrasp.sim.simulators import open_scene
 
 HANDS = ("allegro", "barrett", "allegro_biotac")
 

@@ -24,9 +24,9 @@ from torchgrasp.geometry.plane import GRID, Plane, to_upright
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.convex_parts import read_solid
-from torchgrasp.sim.scene import open_scene
 from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand
+from torchgrasp.sim.simulators import open_scene
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 

@@ -12,7 +12,6 @@ import numpy as np
 from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
-from torchgrasp.specs import Simulator
 
 STILL = np.zeros(3)  # no force, no torque
 
@@ -79,6 +78,7 @@ class Scene(abc.ABC):
     >>> pose[2, 3] = 1.0  # [m] above the jug
     >>> start, tips = dict.fromkeys(hand.tree.joint_names, 0.1), hand.tips.links
     >>> spec = SceneSpec(hand.urdf_path, pose, start, hand.actuators, tips, jug.mesh, jug.parts, 0.2, yields=0.02)
+    >>> from torchgrasp.sim import open_scene
     >>> scene = open_scene(dataclasses.replace(spec, approach=(0.0, 0.0, -0.1)))
     >>> scene.penetration(), scene.neighbour_poses().shape
     (0.0, (0, 4, 4))
@@ -167,31 +167,6 @@ class Scene(abc.ABC):
     def tip_poses(self) -> np.ndarray:
         """Return the poses (f, 4, 4) of the fingertips' links."""
         return np.array([self._pose(tip) for tip in self.tips])
-
-
-@checked
-def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> Scene:
-    """Return a fresh scene at its start.
-
-    Raises:
-        BadArgument: an unknown simulator, or a joint of the hand without a position or drive.
-        HandFileError: the hand's URDF is not valid.
-        MissingExtra: the simulator is not installed.
-
-    >>> from torchgrasp import load_hand, load_object
-    >>> jug, hand = load_object("jug"), load_hand("barrett")
-    >>> start, tips = dict.fromkeys(hand.tree.joint_names, 0.1), hand.tips.links
-    >>> spec = SceneSpec(hand.urdf_path, np.eye(4), start, hand.actuators, tips, jug.mesh, jug.parts, mass=0.2)
-    >>> open_scene(spec).object_pose().shape
-    (4, 4)
-    """
-    if simulator == "mujoco":
-        from torchgrasp.sim.mujoco_scene import MujocoScene
-
-        return MujocoScene(spec)
-    from torchgrasp.sim.sapien_scene import SapienScene
-
-    return SapienScene(spec)
 
 
 def check_vector(name: str, vector: np.ndarray) -> None:

@@ -10,22 +10,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.common import Options, Row, bench
+from benchmarks.gpu.kernels import Kernel, kernels
 from torchgrasp.base import Value, named_tensors
-
-
-@dataclasses.dataclass(frozen=True)
-class Kernel:
-    """A function of arguments that `prepare` makes on the CPU for a size, in units of `what`.
-
-    `tolerance` bounds the relative error of its result, or with `agree` what that returns of both results.
-    """
-
-    name: str
-    what: str
-    sizes: tuple[int, ...]
-    prepare: Callable[[int], tuple[Callable[..., Any], tuple[Any, ...]]]
-    tolerance: float
-    agree: Callable[[Any, Any], float] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +31,6 @@ def measure_kernels(o: Options) -> list[Row]:
     if not torch.cuda.is_available():
         print("no GPU here")
         return []
-    from benchmarks.gpu.kernels import kernels
 
     device = torch.device("cuda", torch.cuda.current_device())
     return [bench_kernel(kernel, device, (1, 8)) for kernel in kernels(o.scale < 1)]

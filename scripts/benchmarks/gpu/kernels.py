@@ -1,12 +1,13 @@
 """The kernels of the chain, each with the sizes at which it is timed."""
 
+import dataclasses
+from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
 
 import torch
 
 from benchmarks.common import random_view
-from benchmarks.gpu.compare import Kernel
 from torchgrasp import (
     Contacts,
     ContactSpec,
@@ -35,6 +36,22 @@ from torchgrasp.shape.surface import extract_surface
 from torchgrasp.shape.values import Normalisation, on_surface
 from torchgrasp.testing import random_joints
 from torchgrasp.values import PointCloud
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """A function of arguments that `prepare` makes on the CPU for a size, in units of `what`.
+
+    `tolerance` bounds the relative error of its result, or with `agree` what that returns of both results.
+    """
+
+    name: str
+    what: str
+    sizes: tuple[int, ...]
+    prepare: Callable[[int], tuple[Callable[..., Any], tuple[Any, ...]]]
+    tolerance: float
+    agree: Callable[[Any, Any], float] | None = None
+
 
 SPEC = ContactSpec(table=0.0)
 COMPONENTS = 41
