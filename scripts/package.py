@@ -22,7 +22,7 @@ OLDEST, NEWEST = 10, 14
 """Minor versions of Python 3 that are looked for."""
 MOST_BYTES = 3_000_000
 """Of the wheel: what is downloaded each time."""
-CLOUD = "torchgrasp/data/shipped/data/jug/view.ply"
+CLOUD = "torchgrasp/data/assets/jug/view.ply"
 """The cloud of the main job."""
 
 

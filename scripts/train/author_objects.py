@@ -1,4 +1,4 @@
-"""Write the files of torchgrasp's own objects into torchgrasp/data/shipped/data, the same bytes every time.
+"""Write the files of torchgrasp's own objects into torchgrasp/data/assets, the same bytes every time.
 
 Run it after a change of `train/object_shapes.py` or of the virtual camera; it needs the extra `dev`.
 """

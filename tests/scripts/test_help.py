@@ -1,5 +1,6 @@
 """Every script says what it does."""
 
+import re
 import runpy
 import subprocess
 import sys
@@ -25,6 +26,13 @@ def test_a_shell_script_has_help_and_sets_nothing_up_for_it(path, tmp_path):
     done = subprocess.run([path, "--help"], cwd=tmp_path, env={"PATH": "/usr/bin:/bin"}, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr == ""
     assert path.read_text().splitlines()[1] == f"# {done.stdout.strip()}"
+
+
+def test_files_that_scripts_name_exist():
+    root = Path(__file__).parents[2]
+    for path in (*(root / "scripts").rglob("*.py"), *SHELL):
+        named = re.findall(r"\btorchgrasp/[\w/]+(?:\.\w+)?", path.read_text())
+        assert [name for name in named if not (root / name).exists()] == [], path
 
 
 def test_scripts_are_found():
