@@ -25,7 +25,7 @@ class Range(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The mark of a batch in a value, `Annotated[Contacts, Rows("g")]`: its length is that of the letter."""
+    """Marks a batch in a field, as `Annotated[Contacts, Rows("g")]`: it has as many rows as the axis g of tensors."""
 
     letter: str
 

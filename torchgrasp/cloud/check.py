@@ -125,7 +125,7 @@ def _guess_unit(extent: float) -> str:
 
 
 def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
-    """Return the ascending indices of the first of all coincident points."""
+    """Return the indices of the distinct points, ascending: of coincident points only the first."""
     from scipy.spatial import KDTree
 
     points = points.detach().double()

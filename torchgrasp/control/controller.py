@@ -107,7 +107,7 @@ class GraspController:
 
     @property
     def status(self) -> Status:
-        """`OK`, or `TOO_HEAVY` if the holding "grip" feels more load than the hand can hold: put the object down."""
+        """`OK`, or `TOO_HEAVY` if the hold mode "grip" feels more load than the hand can hold: put the object down."""
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
 
     @property

@@ -83,7 +83,7 @@ def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
 
 
 class Touches:
-    """Averages of the contacts of a hand that stands still, in the frame of the undisplaced hand.
+    """Touched points and normals of a hand at rest, averaged over time, in the frame of the hand's planned pose.
 
     `known` are fingertips with a working sensor, `felt` those that reported the place of a contact.
     """

@@ -30,7 +30,7 @@ OPENING_TIME = 0.5  # time [s] in which the fingers open
 
 
 def can_guard(reference: ClosingReference) -> bool:
-    """Return whether touches during the approach locate the object: by their places, table and surface."""
+    """Return whether a guarded move is possible: table and surface are known, and fingertips feel where they touch."""
     known = reference.approach is not None and reference.table is not None and reference.surface is not None
     return known and reference.sensor.kind == "tactile"
 

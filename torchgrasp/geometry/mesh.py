@@ -143,7 +143,7 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Return the mesh that trimesh reads from the bytes of a file; its readers raise errors of any kind.
+    """Return the mesh that trimesh reads from the bytes of a file; a malformed file may raise any exception.
 
     Args:
         data: of the file.

@@ -163,12 +163,12 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
-        """Return every movable joint of the URDF by name."""
+        """Return the positions of all movable joints of the URDF by name, from those of the actuated joints."""
         return dict(zip(self.tree.joint_names, self.expand_joints(joints).unbind(-1), strict=True))
 
     @checked(gradients=True)
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return every movable joint of the URDF, as in `tree.joint_names`."""
+        """Return the positions of all movable joints, in the order of `tree.joint_names`, from the actuated ones."""
         return self.actuated.expand(joints)
 
     @checked(gradients=True)

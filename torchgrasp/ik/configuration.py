@@ -61,7 +61,7 @@ class SpatialJacobian(Value):
 
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
-        """Evaluate the forward kinematics once."""
+        """Return the frames and axes from which Jacobians at configurations follow, by one call of the kinematics."""
         root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
         frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
         spheres, tips, pads, origins, turning, sliding = hand.motion.place(frames)

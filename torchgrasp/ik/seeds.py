@@ -200,7 +200,7 @@ def _likely_assignments(
 def query_mixture(
     hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: Count = 8, max_energy: Positive = DEFAULT_ENERGY
 ) -> IKSeeds:
-    """Return the learned model's configurations near the contacts, in all six assignments (Eqs. 21-24).
+    """Return the learned model's configurations near the contacts, in all six assignments (the paper's Eqs. 21-24).
 
     For every assignment within reach (Eq. 21) the joints are the conditional mean (Eq. 23) and the means of the most
     responsible components, clamped to the limits. Eq. (24) places the hand. Fingertips are still off by centimetres.
@@ -211,7 +211,7 @@ def query_mixture(
         contacts: triples on the object; hand and mixture are moved to their device.
         mixture: the hand's learned model.
         n_seeds: for each assignment, at most one more than the mixture has components.
-        max_energy: threshold on the least f_i of Eq. (21); `PAPER_ENERGY` is the paper's.
+        max_energy: largest distance of a code from the nearest component, f_i of Eq. (21); the paper's: `PAPER_ENERGY`.
 
     Raises:
         BadArgument: a mixture of another hand, limits or fingertips, a number out of range, or malformed contacts.

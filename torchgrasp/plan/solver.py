@@ -54,7 +54,7 @@ FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)  # th
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """Contacts with the tensions of their pairs, and the shape at their normalised points."""
+    """Normalised contacts, the internal force between each pair of contacts, and the shape at the contacts."""
 
     points: Vectors
     tension: Float[Tensor, "b p"]

@@ -287,7 +287,7 @@ def _with_arrays(value: Any) -> Any:
 
 
 def _with_tensors(sent: Any) -> Any:
-    """Return the value of `_with_arrays`."""
+    """Return a value that another process received from `_with_arrays`, with tensors again."""
     if isinstance(sent, np.ndarray):
         return torch.from_numpy(sent)
     if isinstance(sent, tuple) and isinstance(sent[0], type):

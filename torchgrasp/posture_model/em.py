@@ -168,8 +168,8 @@ def maximisation(
     """Return the most likely components for the weighted sums; collapsed components are placed anew.
 
     A component collapses if its covariance is singular or its responsibilities sum to less than d + 1 rows. Half of the
-    heaviest component, split across its longest axis, then replaces it. If every component collapses, or one more than
-    `MAX_RESEEDS` times, `IndefiniteCovariance` is raised. Where none collapses, `reseeded` is returned itself.
+    heaviest component, split across its longest axis, then replaces it. If every component collapses, or one component
+    collapses more than `MAX_RESEEDS` times, `IndefiniteCovariance` is raised. `reseeded` counts the collapses.
     """
     components = components_from_sums(sums, n, regularisation)
     weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()

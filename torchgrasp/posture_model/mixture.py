@@ -97,7 +97,7 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
 
 
 def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
-    """Return the codes of three postures between the limits; they depend on limits, links and fingertips."""
+    """Return codes (Eqs. 15-18) of three fixed postures: a fingerprint of the hand that a model was learned for."""
     lower, upper = hand.lower.double(), hand.upper.double()
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
     index = (torch.arange(hand.dof)[None] + torch.arange(3)[:, None]) % 3

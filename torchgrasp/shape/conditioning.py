@@ -32,7 +32,7 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
 
 
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
-    """Refuse observations beyond the kernel's diameter, unless K is positive definite.
+    """Refuse observations farther apart than the kernel allows (its diameter), unless K is positive definite.
 
     Generous noise on some rows can hide an indefinite K, so K is factored again with the least noise on all rows.
     """

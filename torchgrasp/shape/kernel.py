@@ -141,7 +141,7 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return "thin_plate", "matern52" or "rbf" with the thin plate's prior variances, psi^3 and 6 psi.
+    """Return the kernel "thin_plate", "matern52" or "rbf"; each has the prior variances psi^3 and 6 psi (slope).
 
     Raises:
         BadArgument: another name.

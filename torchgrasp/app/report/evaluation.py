@@ -110,7 +110,7 @@ def _share_cells(share: Share, digits: int) -> tuple[str, ...]:
 def _object_rows(
     scores: Sequence[ViewScore], views: Sequence[str], by_object: Mapping[str, Any]
 ) -> list[tuple[str, ...]]:
-    """Return the shares of each object, with a column for each view."""
+    """Return a row for each object: its shares of passed trials, and the outcome of each view."""
     outcome = {}
     for score in scores:
         passed = f"{sum(attempt.passed for attempt in score.attempts)} / {len(score.attempts)}"

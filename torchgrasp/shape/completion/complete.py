@@ -202,7 +202,7 @@ class _Mirror:
 
     @classmethod
     def of(cls, scorer: SymmetryScorer, number: int, plane: Float[Tensor, "4"], score: Float[Tensor, ""]) -> "_Mirror":
-        """Return the mirror of a plane."""
+        """Return a mirror plane with the planes near it and their probabilities."""
         steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype)
         near = planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps)
         return cls(number, plane, float(score), near, torch.softmax(scorer.score(near)[0] / TEMPERATURE, 0))
