@@ -14,8 +14,10 @@ from torchgrasp.errors import BadArgument, SuspiciousScale
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.plane import Plane, move, upright_frame
 from torchgrasp.ik.ranking import FEATURES, MODEL, rank_by_success, success_features
+from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.planner.problem import digest
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, encode_fingertips, load_mixture
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import ContactPlan, Contacts
 
@@ -144,6 +146,15 @@ def test_tips_limits_and_clearances_hold(run):
     spheres = hand.sphere_centres(good.joints)
     spheres = spheres @ good.obj_from_hand[:, :3, :3].transpose(1, 2) + good.obj_from_hand[:, None, :3, 3]
     assert float((spheres[..., 2] - hand.collision_spheres.radius).min()) >= SPEC.table
+
+
+def test_executable_grasps_are_within_reach_of_the_learned_model(run):
+    hand, grasps, _ = run
+    contacts, mixture = grasps[grasps.status == Status.OK].contacts, load_mixture(hand.name)
+    assert len(contacts) > 20
+    within = mixture.energy(encode_fingertips(contacts.points, contacts.normals)) < DEFAULT_ENERGY
+    assert float(within.double().mean()) > 0.9  # finger i touches contact i
+    assert len(query_mixture(hand, contacts, mixture, n_seeds=1).row.unique()) > 0.95 * len(contacts)
 
 
 def test_contacts_satisfy_the_spec(run):

@@ -240,3 +240,9 @@ def test_the_less_is_known_of_the_hidden_side_the_larger_is_its_deviation():
         assert factors == sorted(factors) and factors[-3] < factors[-2] < factors[-1] <= 2.0
     assert all(STD_FACTORS[kind, True] <= STD_FACTORS[kind, False] for kind in known)
     assert STD_FACTORS["ball", True] <= STD_FACTORS["vessel", True] < STD_FACTORS["guess", True]
+
+
+@pytest.mark.parametrize("table", [0.0, None])
+def test_the_deviation_has_the_factor_of_the_kind_and_the_table(seen_cylinder, table):
+    shape = fit_shape(seen_cylinder, table=table)
+    assert shape.kind == "revolution" and shape.std_factor == STD_FACTORS[shape.kind, table is not None]
