@@ -31,7 +31,7 @@ def surface_covariance(normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"
 def force_covariance(
     forces: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], deviation: Float[Tensor, "*b"] | None = None
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return Sigma_fd of Eq. (28) [N^2]: the normal force's variance along the normal plus an isotropic floor.
+    """Return Sigma_fd of the paper's Eq. (28) [N^2]: the variance of the normal force, plus an isotropic floor.
 
     `deviation` [N] is the standard deviation of each normal force; None: a tenth of the force.
     """

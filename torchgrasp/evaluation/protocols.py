@@ -151,7 +151,7 @@ def seed_of(seed: Seed, *names: str | int) -> int:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Draw errors of the hand in its planned frame."""
+    """Return random errors of the hand's pose, each a transform in the frame of the planned hand."""
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
     drawn = 2 * torch.rand(count, 6, generator=generator, dtype=torch.float64) - 1

@@ -188,7 +188,7 @@ def closed_exact(
         points: three to five a row.
         normals: outward unit normals.
         friction: coefficient of friction.
-        guess: the `first_balance` of contacts nearby, which most often decides four or five at once; None: unknown.
+        guess: `first_balance` of similar contacts. It saves time for four or five contacts; None: no guess.
     """
     if points.shape[1] == 3:
         return _closed_in_plane(points, normals, friction) & ~degenerate(points)

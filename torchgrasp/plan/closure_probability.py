@@ -34,10 +34,10 @@ OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 
 
 @dataclasses.dataclass(frozen=True)
 class LinePosterior(Batch):
-    """The Gaussian of (d, w) on the lines x + t n, from outside in, normalised.
+    """The joint Gaussian of signed distance d and gradient w along the lines x + t n through contacts, from outside in.
 
     Args:
-        points: planned contacts x.
+        points: planned contacts x, normalised.
         normals: outward unit normals n.
         deviation: standard deviation of the surface at the contact, the unit of nodes and grid.
         distance: mean of d on the grid.

@@ -68,12 +68,12 @@ def walls_of(shape: Shape) -> tuple[Shape, ...]:
 
 
 def triple_jet(shape: Shape, points: Vectors) -> SurfaceJet:
-    """Evaluate the shape at all points of all rows."""
+    """Return mean, variance and derivatives of the shape at all contacts of all rows."""
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))
 
 
 def triple_mean_jet(shape: Shape, points: Vectors) -> MeanJet:
-    """Evaluate the mean alone at all points of all rows, where the shape has a cheaper `mean_jet`."""
+    """Return mean distance and derivatives at all contacts, without the variance if the shape can leave it out."""
     jet = getattr(shape, "mean_jet", shape.jet)(points.flatten(0, 1))
     return MeanJet(*(x.unflatten(0, points.shape[:2]) for x in (jet.distance, jet.gradient, jet.hessian)))
 

@@ -164,7 +164,7 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
 
 
 def start_state(shape: Shape, points: Vectors) -> State:
-    """Return the state of contacts with equal tensions."""
+    """Return the first state of a descent: contacts with equal internal forces between all pairs."""
     return State(points, equal_tensions(points), triple_jet(shape, points))
 
 

@@ -92,9 +92,10 @@ def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int
 
 
 def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
-    """Return the spec with its `flat_radius`, or the widest of `FLAT_RADII` at which enough starts are closed.
+    """Return the spec with a `flat_radius`, and the flat points of the surface as candidates for contacts.
 
-    The candidates are the points of `survey` that are flat there; all of them where too few are.
+    A radius that the spec lacks is the widest of `FLAT_RADII` at which enough starts have form closure. If too few
+    points are flat, all points of `survey` are candidates.
     """
     if spec.flatness is None:
         return Settled(spec, None)

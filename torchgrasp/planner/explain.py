@@ -219,7 +219,8 @@ def explain_empty(
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
     """Return the changes that could prevent many losses, the most helpful first.
 
-    A change counts a fifth for other losses of its stages, because a row names only one of the constraints it fails.
+    A change counts fully for the failures that it prevents, and one fifth for other failures at the same stage, because
+    a row names only one of the constraints that it fails.
     """
     contacts = frozenset(status for status in Status if status < Status.OUT_OF_REACH)
     weight = dict[int, float]()

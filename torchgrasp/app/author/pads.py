@@ -127,7 +127,7 @@ def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
 
 
 def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
-    """Return the last joint that moves a tip, and the directions of motion and of the arm in the tip's frame."""
+    """Return the last joint that moves a tip; in the tip's frame, its direction of motion and that from the joint."""
     tip_from_above = np.eye(4)
     for joint in urdf.joints_above(tip):
         if joint.kind != "fixed":
@@ -164,7 +164,7 @@ def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
 
 
 def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
-    """Return the pad of a tip that moves along `motion`; on a sphere it is tilted outward."""
+    """Return the pad of a tip: the side towards its motion, on a sphere tilted towards the end of the finger."""
     if shape.kind == "sphere":
         normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]
         center, normal = np.array(shape.xyz), normal / np.linalg.norm(normal)

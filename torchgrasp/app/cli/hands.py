@@ -148,7 +148,7 @@ class HandTrain(Command):
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:
-    """Return the number of Gaussians with the least BIC on other postures, and print the curve."""
+    """Return the number of Gaussians with the least BIC, on postures that the fit does not use; print the curve."""
     candidates = range(5, 61, 5)  # as in Fig. 6
     apart = sample_configurations(hand, 40_000, seed + 1, workers, "grasping")
     with make_bar(len(candidates), "fit", desc="components") as bar:

@@ -169,7 +169,7 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return a direction from which all fingers of the first row are visible: across the horizontal normals."""
+    """Return a view direction from which all fingers of the first grasp are visible: at right angles to the normals."""
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
     across = torch.stack([-press[1], press[0]])

@@ -33,8 +33,8 @@ class Silhouette(Value):
         depth: depth [m] of the nearest visible pixel.
         rim: points of the outline [m] at the visible depth.
         rim_normals: normals there of the cone that the camera and the outline span.
-        cut: whether the object reaches the border of the image. Beyond it nothing is outside the outline.
-        gap: greatest width [m] of a part within the outline where nothing was measured; 0: none. It may be a hole.
+        cut: whether the object reaches the border of the image. Points beyond the border do not count as outside.
+        gap: greatest width [m] of a part of the outline without measurements, perhaps a hole; 0: none.
     """
 
     viewpoint: Float[Tensor, "3"]

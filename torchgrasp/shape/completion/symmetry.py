@@ -166,7 +166,7 @@ def find_plane_through_axis(
 def planes_near(
     scorer: SymmetryScorer, plane: Float[Tensor, "4"], angles: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
 ) -> Float[Tensor, "p 4"]:
-    """Return a plane rotated about its axes [rad] and shifted [m]. A table leaves the vertical axis."""
+    """Return planes near a plane: turned by angles [rad] and shifted [m]; on a table about the vertical alone."""
     normal = plane[:3]
     if scorer.upright:
         sideways = torch.stack([-normal[1], normal[0], torch.zeros_like(normal[0])])[None]
