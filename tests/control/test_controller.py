@@ -16,10 +16,17 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.specs import TrialSpec
 
 PRESSED = (2.0, 2.0, 4.0)
+CLOSE = TARGET * real([1.0, 1.0, 0.2])  # two contacts side by side: unequal forces need little friction
 
 
 def run(controller, seen, seconds):
     return [controller.step(seen, PERIOD).joints for _ in range(round(seconds / PERIOD))]
+
+
+def off(forces: torch.Tensor, proportions: torch.Tensor) -> float:
+    """The distance of the normal forces' proportions from given ones."""
+    push = -(forces * NORMALS).sum(-1)
+    return float((push / push.max() - proportions).norm())
 
 
 def test_desired_forces_balance_or_press_along_the_normals():
@@ -37,6 +44,25 @@ def test_held_forces_balance_at_the_sensed_contacts():
     planned, total = held_forces(reference(), observation(contact=torch.tensor([True, True, False])))
     assert torch.equal(planned, GAINS.desired_force)
     assert total == pytest.approx(8.0)
+
+
+def test_desired_forces_approach_preferred_proportions():
+    preferred = real([0.8, 0.2, 1.0])
+    even, led = (desired_forces(CLOSE, NORMALS, 4.0, x) for x in (None, preferred))
+    assert led.sum(0).abs().max() < 1e-9
+    assert off(led, preferred) < 0.5 * off(even, preferred)
+
+
+def test_held_forces_keep_the_proportions_of_the_stability_model_alone():
+    planned, seen = real([3.2, 0.8, 4.0]), observation(contact=TOUCHING)
+    seen = dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, points=CLOSE))
+    gains = dataclasses.replace(GAINS, desired_force=-planned[:, None] * NORMALS)
+    even, led = (
+        held_forces(dataclasses.replace(reference(), gains=dataclasses.replace(gains, force_source=x)), seen)[0]
+        for x in ("analytic", "stability")
+    )
+    assert led.sum(0).abs().max() < 1e-9
+    assert off(led, planned / 4.0) < 0.5 * off(even, planned / 4.0)
 
 
 def test_force_hold_exerts_the_forces_and_regulates_their_sum():

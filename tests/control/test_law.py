@@ -191,6 +191,14 @@ def test_eq28_force_gains_follow_the_learned_variance(name):
     assert gains.force_source == "stability"
 
 
+def test_reference_approaches_the_forces_that_the_stability_model_prefers():
+    (hand, grasp, points, normals), model = shipped("barrett"), load_stability(load_hand("barrett"))
+    wanted = model.preferred_forces(points + hand.tips.radius[:, None] * normals, 4.0).forces
+    even, led = (ClosingReference.from_grasp(hand, grasp, 4.0, stability=x).gains.desired_force for x in (None, model))
+    even, led = (float((-(x * normals).sum(-1) - wanted).norm()) for x in (even, led))
+    assert led < 0.9 * even
+
+
 def test_tip_compliance_is_the_motion_for_a_newton():
     """Allegro's joints are driven one by one: pushing with 1 N moves the tip by n.J K^-1 J^T n."""
     hand = load_hand("allegro")

@@ -109,6 +109,8 @@ def test_paper_closing_ends_when_fingers_have_arrived_with_steady_forces():
         return 30
 
     assert ticks(seen=there) < 20
+    near, short = (observation(x, contact=TOUCHING) for x in (0.006, 0.009))  # lambda is 0.64 and 0.37
+    assert ticks(seen=near) < ticks(seen=short) == 30
     assert ticks(seen=far) == ticks(seen=there, rising=0.05) == ticks(seen=observation(0.0)) == 30
 
 
