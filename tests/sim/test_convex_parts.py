@@ -1,5 +1,6 @@
 """Convex parts of a mesh: volumes, cache, refusals."""
 
+import subprocess
 import sys
 
 import numpy as np
@@ -8,6 +9,7 @@ import trimesh
 
 from torchgrasp.data.shipped import load_object
 from torchgrasp.errors import MeshError
+from torchgrasp.sim import decompose
 from torchgrasp.sim.convex_parts import check_parts, convex_parts, hull
 
 
@@ -56,12 +58,18 @@ def test_convex_parts_fill_a_concave_mesh_and_are_cached(tmp_path, capfd):
 def test_decompose_refuses_a_mesh_that_takes_too_long(tmp_path, monkeypatch):
     """The jug takes 4 s; here it has one."""
     pytest.importorskip("coacd")
-    module = sys.modules["torchgrasp.sim.convex_parts"]  # the package has a function of this name
-    monkeypatch.setattr(module, "SECONDS", 1.0)
-    monkeypatch.setattr(module, "SECONDS_PER_FACE", 0.0)
+    monkeypatch.setattr("torchgrasp.sim.decompose.SECONDS", 1.0)
+    monkeypatch.setattr("torchgrasp.sim.decompose.SECONDS_PER_FACE", 0.0)
     with pytest.raises(MeshError, match=r"3516 faces that CoACD cannot cut in 1 s"):
         convex_parts(load_object("jug").mesh, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_process_that_decomposes_loads_neither_torch_nor_the_library():
+    """What it loads counts towards its limit of memory, and costs its time."""
+    code = "import runpy, sys; runpy.run_path(sys.argv[1]); print({'torch', 'torchgrasp'} & set(sys.modules))"
+    words = [sys.executable, "-c", code, decompose.__file__]
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "set()\n"
 
 
 def test_check_parts_keeps_convex_parts_and_refuses_others():

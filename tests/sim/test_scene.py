@@ -21,7 +21,7 @@ from torchgrasp.sim.scene_spec import (
     euler_from_rotation,
     mounted_urdf,
 )
-from torchgrasp.sim.simulators import open_scene
+from torchgrasp.sim.simulated_hand import open_scene
 
 
 def test_euler_angles_rebuild_the_rotation():

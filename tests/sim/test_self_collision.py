@@ -13,7 +13,7 @@ from torchgrasp.errors import HandFileError, Status
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.scene_spec import SceneSpec, pair_masks
-from torchgrasp.sim.simulators import open_scene
+from torchgrasp.sim.simulated_hand import open_scene
 
 HANDS = ("allegro", "barrett", "allegro_biotac")
 

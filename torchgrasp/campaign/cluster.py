@@ -19,6 +19,8 @@ from torchgrasp.planner.grasps import no_grasps
 
 PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoco", "coacd")
 """Packages on whose versions the numbers depend."""
+Result = TypeVar("Result")
+CONNECTING = "30s"  # longest time for the scheduler to answer
 
 
 def versions() -> dict[str, str]:
@@ -84,11 +86,6 @@ def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
     """Return the shard of a job without cloud and grasps."""
     points, tried = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, draws, dtype=torch.int64)
     return Shard((row,), Records(points, torch.zeros(1, 3, dtype=torch.float64), no_grasps(hand), tried.bool(), tried))
-
-
-Result = TypeVar("Result")
-
-CONNECTING = "30s"  # longest time for the scheduler to answer
 
 
 def run_on_cluster(

@@ -22,6 +22,25 @@ FAILED = (Status.WORKER_DIED, Status.TIMED_OUT, Status.BROKEN)
 
 Work = Callable[[Sequence[int]], Generator[tuple[int, bytes | Status], None, None]]
 """Takes numbers of jobs; yields, as they end, place among these and file of each, or how its process ended."""
+FIELDS = (
+    ("points", "p x 3", "cloud of each job, one behind the other [m]"),
+    ("viewpoints", "j x 3", "position of the camera [m]; zeros: unknown"),
+    ("grasps.joints, grasps.pregrasp", "g x h", "actuated joints, closed and opened [rad]"),
+    ("grasps.obj_from_hand", "g x 4 x 4", "pose of the hand's base link in the object's frame [m]"),
+    ("grasps.approach", "g x 3", "direction of the straight path to the pre-grasp"),
+    ("grasps.contacts.points, .normals", "g x f x 3", "planned contacts and outward normals"),
+    ("grasps.contacts.std_m", "g x f", "standard deviation of the surface at the contact [m]"),
+    ("grasps.contacts.variance", "g x f", "the same in the normalised units of the shape"),
+    ("grasps.certificate.margin, .closed", "g", "how far from losing form closure, and whether it has it"),
+    ("grasps.certificate.witness", "g x 6", "the wrench that is hardest to resist"),
+    ("grasps.certificate.rank_ratio, .residual", "g", "how well the certificate itself is conditioned"),
+    ("grasps.clearance, .tip_error, .normal_angle", "g, g x f, g x f", "distances [m] and angles [rad] of the plan"),
+    ("grasps.permutation", "g x f", "contact of each finger in the plan"),
+    ("grasps.score", "g", "log-odds of the predicted success"),
+    ("grasps.status", "g", "0: executable; all are"),
+    ("passed, outcome", "g x d", "verdict of each try in the simulator, and its Status"),
+)
+"""Tensors of a shard: name, shape and meaning."""
 
 
 class Campaign(NamedTuple):
@@ -174,27 +193,6 @@ class _Store:
         if len(shard.rows) != 1 or (row.object, row.view) != (asked.object, asked.view):
             raise ModelFileError("path", f"{(row.object, row.view)}", f"{(asked.object, asked.view)}")
         return row
-
-
-FIELDS = (
-    ("points", "p x 3", "cloud of each job, one behind the other [m]"),
-    ("viewpoints", "j x 3", "position of the camera [m]; zeros: unknown"),
-    ("grasps.joints, grasps.pregrasp", "g x h", "actuated joints, closed and opened [rad]"),
-    ("grasps.obj_from_hand", "g x 4 x 4", "pose of the hand's base link in the object's frame [m]"),
-    ("grasps.approach", "g x 3", "direction of the straight path to the pre-grasp"),
-    ("grasps.contacts.points, .normals", "g x f x 3", "planned contacts and outward normals"),
-    ("grasps.contacts.std_m", "g x f", "standard deviation of the surface at the contact [m]"),
-    ("grasps.contacts.variance", "g x f", "the same in the normalised units of the shape"),
-    ("grasps.certificate.margin, .closed", "g", "how far from losing form closure, and whether it has it"),
-    ("grasps.certificate.witness", "g x 6", "the wrench that is hardest to resist"),
-    ("grasps.certificate.rank_ratio, .residual", "g", "how well the certificate itself is conditioned"),
-    ("grasps.clearance, .tip_error, .normal_angle", "g, g x f, g x f", "distances [m] and angles [rad] of the plan"),
-    ("grasps.permutation", "g x f", "contact of each finger in the plan"),
-    ("grasps.score", "g", "log-odds of the predicted success"),
-    ("grasps.status", "g", "0: executable; all are"),
-    ("passed, outcome", "g x d", "verdict of each try in the simulator, and its Status"),
-)
-"""Tensors of a shard: name, shape and meaning."""
 
 
 def card_of(asked: dict[str, Any], campaign: str, rows: Sequence[JobRow], digests: Sequence[str]) -> dict[str, Any]:

@@ -16,6 +16,11 @@ from torchgrasp.plan.forces import least_friction_forces
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
 
 RAMP = 0.4  # time [s] in which the forces rise to the desired forces
+MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations of its reading
+PRIOR_STD, MIN_STD = 0.2, 0.03  # standard deviation of the friction estimate at the start, and its least value
+SLIDING = 0.008  # speed [m/s] from which a fingertip counts as sliding
+FORCE_LAG = 0.03  # time [s] of sliding until the filtered forces show the friction
+LIFTED = 0.35  # load [N] from which the object counts as lifted
 
 
 class ForceHold:
@@ -79,17 +84,6 @@ def held_forces(reference: ClosingReference, observation: Observation) -> tuple[
         if bool(torch.isfinite(balanced).all()):
             forces, normals = balanced, sensed.normals
     return forces, float(-((forces * normals).sum(-1) * reference.alive).sum())
-
-
-MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations of its reading
-
-PRIOR_STD, MIN_STD = 0.2, 0.03  # standard deviation of the friction estimate at the start, and its least value
-
-SLIDING = 0.008  # speed [m/s] from which a fingertip counts as sliding
-
-FORCE_LAG = 0.03  # time [s] of sliding until the filtered forces show the friction
-
-LIFTED = 0.35  # load [N] from which the object counts as lifted
 
 
 class FrictionEstimate:

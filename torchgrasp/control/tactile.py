@@ -20,6 +20,7 @@ NOISE = 0.1  # standard deviation [N] of the normal force (Sec. 6.5).
 FLAG_CUTOFF = 5.0  # cut-off [Hz] of the average force behind the contact flag
 
 TOUCH_ON = 0.2  # average force [N] at which the contact flag turns on; it turns off at half of this force
+STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays on its path
 
 
 @checked
@@ -150,9 +151,6 @@ def flag(before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: F
 def low_pass(cutoff: float, period: float) -> float:
     """Return the new value's share in a first-order low-pass, given cut-off [Hz] and period [s]."""
     return 1 - math.exp(-2 * math.pi * cutoff * period)
-
-
-STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays on its path
 
 
 class Targets(NamedTuple):

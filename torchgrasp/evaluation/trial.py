@@ -25,8 +25,7 @@ from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
-from torchgrasp.sim.simulated_hand import SimulatedHand
-from torchgrasp.sim.simulators import open_scene
+from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 

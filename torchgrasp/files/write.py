@@ -17,6 +17,7 @@ from filelock import FileLock, Timeout
 from torchgrasp.errors import OutputError, Status
 
 ENDING = ".part"  # ending of the name under which a file is written; a dot and the name of the file come first
+LOCK = ".lock"  # name of the lock file in a folder. It holds the process and host of the run.
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
@@ -108,9 +109,6 @@ def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
     """Return one row as a line of text; a column of negative width is flush left."""
     columns = zip(cells, widths, strict=True)
     return "  ".join(f"{cell!s:{'<' if w < 0 else '>'}{abs(w)}}" for cell, w in columns).rstrip()
-
-
-LOCK = ".lock"  # name of the lock file in a folder. It holds the process and host of the run.
 
 
 @contextlib.contextmanager

@@ -85,7 +85,7 @@ def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
 
 
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
-    """Return which contacts lie near a line: their largest triangle is flatter than `min_ratio`."""
+    """Return which contacts lie near a line: their largest triangle is too flat."""
     # Least height of the largest contact triangle over its longest side: noise turns the frame of a flatter one
     min_ratio = 1e-3
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)

@@ -29,6 +29,8 @@ from torchgrasp.ik.refine import ITERATIONS, grasp_residuals, refine, tip_target
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 
 Result = TypeVar("Result", bound=Batch)
+ANGLE = 0.01  # unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances
+FAR = 20.0  # clearance [mm] above which clearances are not distinguished
 
 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
@@ -133,10 +135,6 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_seeds(problem, seeds), (2, 4), partial(refine_on_contacts, problem))
     return best_first(best_grasps(attempts)[0])
-
-
-ANGLE = 0.01  # unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances
-FAR = 20.0  # clearance [mm] above which clearances are not distinguished
 
 
 def refine_by_cobyla(

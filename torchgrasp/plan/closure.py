@@ -30,6 +30,17 @@ MIN_MARGIN = 1e-6
 """Least positive coefficient: far above the certificate's errors, far below equal coefficients, 1 / (f e)."""
 MIN_RANK_RATIO = 1e-3
 """Least singular value of the wrench matrix over its largest. Eq. (13) alone also holds for contacts on a line."""
+PIVOTS = 100  # most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the optimum
+OPTIMAL = 1e-12  # multipliers below this are zero: the objective grows no further
+ARTIFICIAL_GAIN = 1e3  # added to the gain of the artificial rows, far above any multiplier: they leave first
+BLOCKING = 1e-11  # a bound approached more slowly than this, for each unit of the step, is parallel to it
+GRASPS_PER_CHUNK = 2048  # grasps at a time: their tableaux stay in the cache
+PARALLEL = 1e-9
+"""Planar wrenches (of length about 1) with a shorter cross product are parallel: above rounding in float64."""
+FIRST_EDGES = 4  # edges of a cone in the first programme
+ROUNDS = 12
+"""Most programmes: twenty random grasps of four contacts close at friction 2e-7 too great at most, relatively; after
+eight programmes it is 4e-5."""
 
 
 def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
@@ -92,13 +103,6 @@ def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
     """Return the smallest over the largest singular value of each wrench matrix."""
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
-
-
-PIVOTS = 100  # most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the optimum
-OPTIMAL = 1e-12  # multipliers below this are zero: the objective grows no further
-ARTIFICIAL_GAIN = 1e3  # added to the gain of the artificial rows, far above any multiplier: they leave first
-BLOCKING = 1e-11  # a bound approached more slowly than this, for each unit of the step, is parallel to it
-GRASPS_PER_CHUNK = 2048  # grasps at a time: their tableaux stay in the cache
 
 
 def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
@@ -167,14 +171,6 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
     phi = margin[:, None].expand(b, m).scatter_add(1, index, m * multiplier)
     witness = torch.where((ray != 0).any(1, keepdim=True), ray, vertex)
     return phi, witness / torch.linalg.vector_norm(witness, dim=1, keepdim=True)
-
-
-PARALLEL = 1e-9
-"""Planar wrenches (of length about 1) with a shorter cross product are parallel: above rounding in float64."""
-FIRST_EDGES = 4  # edges of a cone in the first programme
-ROUNDS = 12
-"""Most programmes: twenty random grasps of four contacts close at friction 2e-7 too great at most, relatively; after
-eight programmes it is 4e-5."""
 
 
 def closed_exact(

@@ -18,6 +18,10 @@ from torchgrasp.base import Value
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.posture_model.gaussian import whitening_matrices
 
+CACHED_ROWS = 2048  # rows of one pass: their features and responsibilities stay in the cache
+SINGULAR_VARIANCE = 1e-12  # a conditional variance of this size is rounding, beside the data's variance of 1
+MAX_RESEEDS = 3  # a component that collapses more often shows that the data support fewer components
+
 
 @dataclasses.dataclass(frozen=True)
 class Shard:
@@ -47,11 +51,6 @@ class Shard:
     def count(self) -> int:
         """Count the rows of all processes."""
         return int(self.sum(self.rows.new_tensor(len(self.rows), dtype=torch.int64)))
-
-
-CACHED_ROWS = 2048  # rows of one pass: their features and responsibilities stay in the cache
-SINGULAR_VARIANCE = 1e-12  # a conditional variance of this size is rounding, beside the data's variance of 1
-MAX_RESEEDS = 3  # a component that collapses more often shows that the data support fewer components
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,6 +18,10 @@ from torchgrasp.posture_model.em import Components, Progress, Shard, expectation
 from torchgrasp.posture_model.mixture import CODE_NAMES, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 
+MAX_REGULARISATION = 1e-6
+"""Largest variance added to a dimension, relative to the data's: scikit-learn's default, which is absolute there."""
+TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes some hundred
+
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
@@ -72,11 +76,6 @@ class Checkpoint:
         components = Components(tensors["weights"], tensors["means"], tensors["covariances"])
         progress = Progress(components, tensors["reseeded"], tensors["log_likelihood"], meta.get("jumped") == "True")
         return progress.to(self.centre.device)
-
-
-MAX_REGULARISATION = 1e-6
-"""Largest variance added to a dimension, relative to the data's: scikit-learn's default, which is absolute there."""
-TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes some hundred
 
 
 @checked

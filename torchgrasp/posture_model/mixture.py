@@ -23,6 +23,10 @@ from torchgrasp.values import ContactCode, Contacts
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
 """The six assignments of three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
 CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")  # the numbers of a code q = (L, N): three lengths [m], three cosines
+PAPER_ENERGY = 2.0
+"""The paper's threshold on f_i of Eq. (21). It accepts 32 % of the codes of a single component (chi-square_6 < 4)."""
+DEFAULT_ENERGY = 6.295793622
+"""Half the 95 % quantile of chi-square_6: in `bench.py hand --only reach` it accepts 95 % of planned grasps or more."""
 
 
 def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b q"]:
@@ -102,12 +106,6 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
     index = (torch.arange(hand.dof)[None] + torch.arange(3)[:, None]) % 3
     return encode_fingertips(*hand.fingertips(lower + share[index] * (upper - lower)))
-
-
-PAPER_ENERGY = 2.0
-"""The paper's threshold on f_i of Eq. (21). It accepts 32 % of the codes of a single component (chi-square_6 < 4)."""
-DEFAULT_ENERGY = 6.295793622
-"""Half the 95 % quantile of chi-square_6: in `bench.py hand --only reach` it accepts 95 % of planned grasps or more."""
 
 
 @checked

@@ -249,9 +249,8 @@ class Scene(Value):
 def read_scene(path: Path | str) -> Scene:
     """Read a scene from a .npz file, as `Scene.from_depth` does.
 
-    Its arrays are `depth` (h, w) in metres or integer millimetres, `intrinsics` (3, 3) or (4,), and optionally
-    `camera_pose` (4, 4), `labels` (h, w) of objects or `mask` (h, w) of the target, `target`, a label, and `table`
-    (4,): normal and offset.
+    It has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are `camera_pose` (4, 4), `labels`
+    or a `mask` of the target (h, w), the label `target`, and `table` (4,): normal and offset.
 
     Raises:
         CloudFileError: no such file, or malformed content.
@@ -286,8 +285,7 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
     if path.suffix.lower() != ".npz":
         raise BadArgument("path", path, "a file ending in .npz")
     labels = np.zeros(scene.image.depth.shape, dtype=np.int32)
-    row, column = scene.pixels.cpu().numpy().T
-    labels[row, column] = scene.labels.cpu().numpy()
+    labels[tuple(scene.pixels.cpu().numpy().T)] = scene.labels.cpu().numpy()
     arrays = {
         "depth": scene.image.depth.cpu().numpy().astype(np.float32),
         "intrinsics": scene.image.intrinsics.cpu().numpy(),

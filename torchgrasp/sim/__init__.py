@@ -2,7 +2,7 @@
 
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.sim.scene import Scene
-from torchgrasp.sim.simulators import open_scene
+from torchgrasp.sim.simulated_hand import open_scene
 from torchgrasp.sim.scene_spec import Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand
 

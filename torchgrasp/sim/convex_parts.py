@@ -4,15 +4,8 @@ A simulator replaces a mesh by its convex hull: a jug would be solid. CoACD cuts
 """
 
 import hashlib
-import importlib.util
-import io
-import json
 import logging
 import os
-import subprocess
-import sys
-import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,84 +17,10 @@ from torchgrasp.checks import checked
 from torchgrasp.errors import MeshError, ModelFileError, OutputError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.geometry.mesh import LEAST_VOLUME, check_solid, read_mesh
+from torchgrasp.sim.decompose import decompose
 
 if TYPE_CHECKING:
     import trimesh
-
-
-SECONDS, SECONDS_PER_FACE = 60.0, 0.005  # processor time [s] that a mesh may take, and further time [s] for each face
-
-
-def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return vertices and faces of the convex parts into which CoACD cuts a mesh.
-
-    Raises:
-        MeshError: CoACD takes more time or memory than the size of the mesh allows, as for a mesh that crosses itself.
-        MissingExtra: CoACD is not installed.
-    """
-    from torchgrasp.errors import MeshError, MissingExtra
-
-    if importlib.util.find_spec("coacd") is None:
-        raise MissingExtra("coacd", "sim")
-    seconds, gibibytes = int(SECONDS + SECONDS_PER_FACE * len(mesh.faces)), 4
-    asked = json.dumps({"seconds": seconds, "memory": gibibytes << 30, "search": search})
-    buffer = io.BytesIO()
-    np.savez(buffer, vertices=mesh.vertices, faces=mesh.faces)
-    paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONSAFEPATH": "1"}
-    try:
-        ended = subprocess.run(
-            [sys.executable, __file__, asked],
-            input=buffer.getvalue(),
-            capture_output=True,
-            timeout=10.0 * seconds,  # of wall time, on a busy machine
-            env=os.environ | paths,
-        )
-        with np.load(io.BytesIO(ended.stdout), allow_pickle=False) as found:
-            return [(found[f"v{k}"], found[f"f{k}"]) for k in range(len(found) // 2)]
-    except (subprocess.TimeoutExpired, OSError, ValueError, EOFError, KeyError) as error:
-        found = f"{len(mesh.faces)} faces that CoACD cannot cut in {seconds} s and {gibibytes} GiB"
-        raise MeshError(
-            "mesh", found, "a mesh that does not cross itself, with fewer faces; or give `parts`"
-        ) from error
-
-
-def main(asked: dict[str, Any]) -> None:
-    """Read a mesh from stdin, decompose it within the limits, and write the parts to stdout."""
-    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
-    _limit(asked["seconds"], asked["memory"])
-    import coacd
-
-    out = os.dup(1)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # CoACD prints here
-    coacd.set_log_level("off")
-    given = np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False)
-    parts = coacd.run_coacd(coacd.Mesh(given["vertices"], given["faces"]), seed=0, **asked["search"])
-    buffer = io.BytesIO()
-    np.savez(buffer, **{f"{name}{k}": x for k, part in enumerate(parts) for name, x in zip("vf", part, strict=True)})
-    with os.fdopen(out, "wb") as pipe:
-        pipe.write(buffer.getvalue())
-
-
-def _end_with_parent(parent: int) -> None:
-    """End the process when its parent has ended."""
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(1)
-
-
-def _limit(seconds: int, memory: int) -> None:
-    """Limit processor time [s] and address space [bytes], where the system can; else the parent's clock must do."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-if __name__ == "__main__":
-    main(json.loads(sys.argv[1]))
 
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}

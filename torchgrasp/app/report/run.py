@@ -26,6 +26,8 @@ from torchgrasp.values import ContactPlan, Grasps, PointCloud
 if TYPE_CHECKING:
     import trimesh
 
+LOST = "lost"  # name of the moment at which an object was lost
+
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -142,9 +144,6 @@ def _too_low(run: Run) -> str:
         return ""
     height, needed = float(spec.plane.height(run.surface.vertices).max()), spec.least_height
     return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm" * (height < needed)
-
-
-LOST = "lost"  # name of the moment at which an object was lost
 
 
 class Moment(NamedTuple):

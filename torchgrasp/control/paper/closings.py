@@ -21,6 +21,8 @@ SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing
 POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
 
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
+TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0  # stiffness of the virtual frame [N/m, N m/rad]
+GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the triangle of fingertips
 
 
 class PaperClosing:
@@ -143,11 +145,6 @@ class OpenLoopClosing:
         self.done = self.time >= 2 * POSE_TIME - 0.5 * period
         first = min(int(progress), 1)
         return torch.lerp(self.poses[first], self.poses[first + 1], progress - first)
-
-
-TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0  # stiffness of the virtual frame [N/m, N m/rad]
-
-GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the triangle of fingertips
 
 
 def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:
