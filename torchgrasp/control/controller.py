@@ -1,4 +1,4 @@
-"""The controller of a grasp, from the approach to the end of the hold; it needs no simulator."""
+"""The grasp controller: guarded approach, closing of the fingers, and hold. It needs no simulator."""
 
 import functools
 from collections.abc import Callable
@@ -24,7 +24,7 @@ Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Maps an observation and the time to the next tick [s] to the targets of all joints [rad]."""
 
 Closing = OpenLoopClosing | PositionClosing | PaperClosing | UncertaintyClosing
-"""What moves the fingers to the object."""
+"""The controllers that move the fingers to the object."""
 
 Period = Annotated[float, Range(1e-5, 1.0)]
 """Time [s] from one tick to the next."""
@@ -35,15 +35,16 @@ CLOSING_TIME = 4.0  # longest time [s] of closing before the hand presses with t
 class GraspController:
     """Close a hand and hold the object: observations in, `Targets` out, all on the CPU.
 
-    A closing brings the fingers to the object, then a holding presses. `closed` turns true `PRESSING_TIME` later: then
-    the hand may be lifted, with further steps. On a table that the reference knows, a hand whose grasp seems too weak
-    to lift opens instead, and closes again where touches locate the object; `attempts` counts the closings.
+    A closing controller brings the fingers to the object, then a hold controller presses. After `PRESSING_TIME` of
+    pressing `closed` is true: the hand may be lifted, while `step` is still called. If the plan knows the table and the
+    grasp seems too weak to lift, the hand opens instead, locates the object from its touches and closes again;
+    `attempts` counts the closings.
 
-    With an `approach` the controller begins before the pre-grasp. While it is `approaching` the arm brings the opened
-    hand to the distance `Targets.left` of its pre-grasp (`GuardedApproach`); `stops` counts how often the hand stopped.
+    With `approach` > 0 the controller begins before the pre-grasp. While `approaching`, a robot arm must keep the
+    opened hand at the distance `Targets.left` from its pre-grasp; `stops` counts the stops at an unexpected touch.
 
     Args:
-        reference: plan of the closing.
+        reference: the closing plan.
         closing, holding, options: as in `TrialSpec`.
         approach: remaining length [m] of the approach; 0: the hand is at its pre-grasp.
 
@@ -87,7 +88,7 @@ class GraspController:
         self.targets = Targets(reference.expand(reference.pregrasp), left=approach)
 
     def _begin(self, closing: Closing) -> None:
-        """Begin to close."""
+        """Start one attempt to close, with the given closing controller."""
         self.closing, self.hold, self.check, self.reopening = closing, None, None, None
         self._make_hold = self._choose_holding(closing)
         self.time, self.pressed = 0.0, 0.0
@@ -112,7 +113,7 @@ class GraspController:
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """Lambda of each finger (Eq. 26) at the last tick; NaN before it and without the control law."""
+        """Lambda of each finger (Eq. 26) at the last tick; NaN before the first tick and without the control law."""
         acts = self.hold is None and self.reopening is None and self.time > 0.0
         if acts and isinstance(self.closing, PaperClosing | UncertaintyClosing):
             return self.closing.share
@@ -122,7 +123,7 @@ class GraspController:
     def step(self, observation: Observation, period: Period) -> Targets:
         """Return the targets of joints and palm for the next tick, a period [s] later.
 
-        The targets do not change in the tick in which the closing ends: that tick computes the forces of the holding.
+        In the tick in which the closing ends the targets do not change: that tick computes the hold's forces.
 
         Raises:
             BadArgument: an observation of another hand, or on another device than the CPU; a period outside `Period`.
@@ -142,7 +143,7 @@ class GraspController:
         return self.targets
 
     def _approach(self, guard: GuardedApproach, observation: Observation, period: float) -> Targets:
-        """Return the targets of the approaching hand; at the end expect the object where it was touched."""
+        """Return the targets of the approaching hand; at its end tell the closing where touches located the object."""
         guard(observation, period)
         if guard.done:
             self.guard, self.stops = None, guard.stops
@@ -151,7 +152,7 @@ class GraspController:
         return Targets(self.targets.joints, guard.palm, guard.left)
 
     def _close_or_hold(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the joint targets of the closing, or of the holding once the closing is over."""
+        """Return the joint targets of the closing controller, or of the hold controller once closing has ended."""
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is not None:
             self.pressed += period
@@ -167,7 +168,7 @@ class GraspController:
         return self.targets.joints
 
     def _judge(self, observation: Observation) -> None:
-        """Open the hand again once the check has found that a lift would fail."""
+        """Start to reopen the hand if the check of the pressing grasp found that a lift would fail."""
         if self.check is None:
             return
         self.check(observation, self.pressed)
@@ -177,7 +178,7 @@ class GraspController:
             self.hold, self.check, self.pressed = None, None, 0.0
 
     def _reopen(self, reopening: Reopening, period: float) -> Targets:
-        """Return the targets of the opening hand; at the end begin to close again."""
+        """Return the targets of the opening hand; once it is open, start the next closing."""
         targets = Targets(reopening(period), reopening.palm)
         if reopening.done:
             closing = self._make_closing()
@@ -187,13 +188,13 @@ class GraspController:
 
 
 def check_holding(closing: str, holding: str) -> None:
-    """Raise `BadArgument` for the holding "law" after a closing without the control law."""
+    """Raise `BadArgument` for the holding "law" after a closing that does not use the control law."""
     if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
         raise BadArgument("holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)")
 
 
 def make_closing(reference: ClosingReference, mode: ClosingMode, options: ClosingOptions) -> Closing:
-    """Return the closing of a mode."""
+    """Return the closing controller of a closing mode."""
     match mode:
         case "open_loop":
             return OpenLoopClosing(reference)
@@ -212,7 +213,7 @@ def make_closing(reference: ClosingReference, mode: ClosingMode, options: Closin
 def choose_holding(
     closing: Closing, mode: HoldingMode
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step]:
-    """Return the constructor of a holding; only "impedance" reads the stability model."""
+    """Return the constructor of the hold controller of a mode; "impedance" also loads the hand's stability model."""
     if mode == "impedance":
         closing.reference.hand.require_three("holding", "'impedance', whose virtual frame is of three,")
         from torchgrasp.control.paper.closings import Impedance

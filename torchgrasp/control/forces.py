@@ -21,20 +21,23 @@ def desired_forces(
     strongest: float = 4.0,
     preferred: Float[Tensor, "*#b f"] | None = None,
 ) -> Float[Tensor, "*b f 3"]:
-    """Return `least_friction_forces`, or `strongest` along the normals where no balanced set presses everywhere."""
+    """Return balanced fingertip forces [N] on the object with the least friction (`least_friction_forces`).
+
+    Where no balanced forces press at every contact, each force has `strongest` [N] along the inward normal.
+    """
     balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
 
 
 def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tensor, "g f 3"]]:
-    """Return planned contact points [m] and normals in the hand's frame."""
+    """Return the planned contact points [m] and normals of grasps in the hand's frame."""
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     contacts = grasps.contacts
     return apply(hand_from_obj, contacts.points.double()), rotate(hand_from_obj, contacts.normals.double())
 
 
 class Squeeze(NamedTuple):
-    """Joint targets [rad] that press, the forces on the object [N] and the joint torques [N m]."""
+    """Joint targets [rad] that press on the object, the fingertip forces [N] and the joint torques [N m]."""
 
     joints: Float[Tensor, "g h"]
     forces: Float[Tensor, "g f 3"]
@@ -71,7 +74,7 @@ def squeeze(
 
 
 def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> None:
-    """Refuse joints or fingers of another hand, and a force or stiffness out of range."""
+    """Raise `BadArgument` for grasps of another hand, or a force [N] or stiffness [N m/rad] out of range."""
     check_fingers(hand, grasps)
     if grasps.joints.shape[-1] != hand.dof:
         raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} joints of {hand.name}")
@@ -82,7 +85,7 @@ def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) ->
 
 
 def check_fingers(hand: Hand, grasps: Grasps) -> None:
-    """Refuse grasps of other fingers than the hand's; grasps without finger names pass."""
+    """Raise `BadArgument` for grasps of other fingers than the hand's; grasps without finger names pass."""
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
     if tuple(names) != hand.finger_names or grasps.contacts.fingertips != len(names):
         found = f"{grasps.contacts.fingertips} contacts a row, of the fingers {', '.join(names)}"
@@ -96,7 +99,7 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return the `Squeeze` with which joints of a stiffness [N m/rad] exert forces [N]."""
+    """Return the joint targets with which drives of a given stiffness [N m/rad] exert fingertip forces [N]."""
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
 
@@ -108,12 +111,12 @@ def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
 
 
 def actuated_stiffness(coupling: Float[Tensor, "j h"], kp: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint, coupled joints included."""
+    """Return the stiffness [N m/rad] of each actuated joint, including the joints that are coupled to it."""
     return (coupling**2 * kp[:, None]).sum(0)
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the `actuated_stiffness` of a hand; all drives have `kp` [N m/rad], or their own stiffness."""
+    """Return the stiffness [N m/rad] of each actuated joint of a hand whose drives have `kp`; None: the hand's own."""
     coupling = hand.actuated.coupling
     return actuated_stiffness(coupling, drive_stiffness(hand, kp).to(coupling))
 
@@ -121,6 +124,6 @@ def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
 def tip_compliance(
     jacobian: Float[Tensor, "*b f 3 h"], normals: Float[Tensor, "*b f 3"], stiffness: Float[Tensor, "h"]
 ) -> Float[Tensor, "*b f"]:
-    """Return the compliance [m/N] of each fingertip along its normal, given the joint stiffness [N m/rad]."""
+    """Return how far [m/N] each fingertip yields along its normal, given the joint stiffness [N m/rad]."""
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

@@ -1,4 +1,4 @@
-"""How a closed hand presses: with the balanced forces of the plan, or with the least forces for the felt load."""
+"""Hold controllers: press with balanced forces at the contacts, or with the least forces that carry the felt load."""
 
 import math
 
@@ -24,14 +24,14 @@ LIFTED = 0.35  # load [N] from which the object counts as lifted
 
 
 class ForceHold:
-    """Press with forces that are balanced at the sensed contacts; the joints stay compliant.
+    """Press with balanced forces at the sensed contacts; the joints stay compliant.
 
-    One common factor regulates the sum of the forces. A loop for each finger would drift and push the object.
+    One common factor of all forces is regulated: a force loop for each finger would drift and push the object.
 
     Args:
-        reference: plan of the closing.
+        reference: the closing plan.
         observation: observation at the end of the closing.
-        start: last targets of all joints [rad].
+        start: joint targets at the end of the closing [rad].
     """
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
@@ -53,7 +53,7 @@ class ForceHold:
 
 
 class PositionHold:
-    """Keep the joint targets of the closing's end; arguments as for `ForceHold`."""
+    """Keep the joint targets that the hand had at the end of the closing; arguments as for `ForceHold`."""
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
         self.start = start
@@ -64,15 +64,15 @@ class PositionHold:
 
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
-    """Return the common factor of the forces a tick later: the integral of the lacking share of `strength` [N]."""
+    """Return the common force factor one tick later: an integral controller of the sum of normal forces [N]."""
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), MAX_FACTOR)
 
 
 def held_forces(reference: ClosingReference, observation: Observation) -> tuple[Float[Tensor, "f 3"], float]:
-    """Return forces [N] that are balanced at the sensed contacts, and the sum [N] of the normal forces with a sensor.
+    """Return balanced forces [N] at the sensed contacts, and the sum [N] of the normal forces of working sensors.
 
-    The planned forces are kept if a finger does not touch or no balanced forces press.
+    If a finger does not touch, or no balanced forces press at every contact, the planned forces are returned.
     """
     gains, normals = reference.gains, reference.normals
     forces = gains.desired_force
@@ -87,13 +87,13 @@ def held_forces(reference: ClosingReference, observation: Observation) -> tuple[
 
 
 class FrictionEstimate:
-    """Mean and standard deviation of the friction of all fingertips on the object."""
+    """A running estimate of the friction coefficient: mean and standard deviation, common to all fingertips."""
 
     def __init__(self) -> None:
         self.mean, self.std = 0.8, PRIOR_STD
 
     def update(self, ratio: float, force: float, lagging: bool = False) -> None:
-        """Revise the estimate by the ratio of tangential to normal force [N] of a sliding fingertip.
+        """Update the estimate by a sliding fingertip's ratio of tangential to normal force, and its normal force [N].
 
         `lagging`: the fingertip has just begun to slide, so the ratio is less certain.
         """
@@ -104,17 +104,17 @@ class FrictionEstimate:
 
     @property
     def low(self) -> float:
-        """A friction that the true one probably exceeds."""
+        """A lower bound: the mean less one standard deviation."""
         return max(self.mean - self.std, 0.15)
 
     @property
     def high(self) -> float:
-        """A friction that the true one probably does not reach."""
+        """An upper bound: the mean plus one standard deviation."""
         return self.mean + self.std
 
 
 class GripHold:
-    """Press with the least forces that carry the felt load.
+    """Press with the least forces that carry the load which the fingertips feel.
 
     `status` turns `TOO_HEAVY` when a fingertip slides at the limits of torque or force. `weight` [N] is the felt load.
 
@@ -144,7 +144,7 @@ class GripHold:
 
     @property
     def weight(self) -> float:
-        """The felt load [N]."""
+        """The load [N] that the fingertips feel."""
         return float(np.linalg.norm(self.load[:3]))
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
@@ -164,13 +164,13 @@ class GripHold:
         return self.start + share * (self.rest + lead - self.start)
 
     def _floor(self) -> np.ndarray:
-        """Return the least normal forces [N]; the limits leave a fifth of the force to the load."""
+        """Return the least allowed normal force [N] of each finger, below 80 % of the largest."""
         floor = np.maximum(self.grip, self.least)
         largest = float((floor / self.planned).max() * self.planned.max())
         return floor * min(1.0, 0.8 * self.solver.most / largest)
 
     def _feel(self, observation: Observation, period: float) -> Balance:
-        """Filter forces, load and normals; return the grasp map of the fingertips."""
+        """Filter the sensed forces, load and normals; return the grasp map of the contacts."""
         normals = _sensed(observation, self.normals)
         self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
         self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
@@ -183,7 +183,7 @@ class GripHold:
         return contacts
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
-        """Return the part of a load that may be a weight: upwards above a known table, with an arm of at most 0.1 m."""
+        """Return the part of a load wrench that weight can cause: upwards from a known table, arm at most 0.1 m."""
         if self.up is None:
             return load
         lifted = max(float(load[:3] @ self.up), 0.0)
@@ -191,7 +191,7 @@ class GripHold:
         return np.concatenate([lifted * self.up, torque])
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """Press harder where a finger slides, revise the friction, and release needless force."""
+        """Press harder where a finger slides, update the friction estimate, and reduce forces that are not needed."""
         speed = observation.tactile.sliding.numpy()
         self.creep = self.creep + low_pass(1.0, period) * (speed.clip(max=SLIDING) - self.creep)
         slides = (speed > SLIDING) & observation.tactile.contact.numpy()
@@ -213,7 +213,7 @@ class GripHold:
         self._release(bool((slides | creeps | ~pressing).any()), period)
 
     def _release(self, moving: bool, period: float) -> None:
-        """Reduce the forces of a lifted load that has been steady, then try less safe friction ratios."""
+        """Reduce the forces once the lifted load has been steady, then assume a higher friction coefficient."""
         if moving:
             self.optimism = 0.0
         if moving or self.weight > 1.05 * self.most:
@@ -227,13 +227,13 @@ class GripHold:
             self.optimism += 0.1 * period
 
     def _enough(self) -> float:
-        """Return an upper bound on the sum of normal forces [N] for the felt load; more would move the object."""
+        """Return an upper bound on the sum of normal forces [N]; larger forces would move the object in the hand."""
         return 3.0 * (self.weight + 0.5) / self.friction.low
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
-        """Choose the friction ratio to aim at, and find out whether the load is too heavy.
+        """Choose the friction coefficient for the next solution, and find out whether the load is too heavy.
 
-        A load is too heavy if a finger slides at the limits: friction and normals are only estimates until then.
+        The load is too heavy only if a finger slides at the limits of torque or force.
         """
         share, push = self.solver.share(self.normals, jacobian), -float((wanted * self.normals).sum())
         goal = min(self.friction.low + self.optimism, self.friction.high)
@@ -247,7 +247,7 @@ class GripHold:
             self.status = Status.TOO_HEAVY
 
     def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
-        """Return the forces of the drives: wanted forces, corrected by internal forces, less the carried load.
+        """Return the forces that the drives exert: the wanted forces, with force feedback, less the carried load.
 
         The drives carry four fifths of the load. Carrying all of it would press ever harder on a rigid table.
         """
@@ -262,6 +262,6 @@ class GripHold:
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:
-    """Return the sensed normals, or given normals where nothing is sensed."""
+    """Return the sensed contact normals, or the given normals where a fingertip senses none."""
     sensed = observation.tactile.normals.numpy()
     return np.where(np.isfinite(sensed).all(-1, keepdims=True), sensed, normals)

@@ -31,7 +31,7 @@ def surface_covariance(normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"
 def force_covariance(
     forces: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], deviation: Float[Tensor, "*b"] | None = None
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return Sigma_fd of the paper's Eq. (28) [N^2]: the variance of the normal force, plus an isotropic floor.
+    """Return Sigma_fd of Eq. (28) [N^2]: the variance of the normal force along the normal, plus an isotropic floor.
 
     `deviation` [N] is the standard deviation of each normal force; None: a tenth of the force.
     """
@@ -40,7 +40,7 @@ def force_covariance(
 
 
 def _normal_covariance(normals: Float[Tensor, "*b 3"], std: Float[Tensor, "*b"], floor: float) -> Tensor:
-    """Return a covariance with a standard deviation along the normal, plus an isotropic one."""
+    """Return covariances (3, 3) with standard deviation `std` along the normal, plus an isotropic `floor`."""
     along = normals[..., :, None] * normals[..., None, :] * std[..., None, None] ** 2
     return along + floor**2 * torch.eye(3, dtype=normals.dtype, device=normals.device)
 
@@ -63,7 +63,7 @@ def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"]
 
 
 def damped_inverse(jacobian: Float[Tensor, "*b m h"], damping: float = 1e-5) -> Float[Tensor, "*b h m"]:
-    """Return J^T (J J^T + damping I)^-1; damping is in m^2."""
+    """Return the damped inverse J^T (J J^T + damping I)^-1 of a Jacobian; `damping` is in m^2."""
     m, h = jacobian.shape[-2:]
     transposed = jacobian.transpose(-1, -2)
     if m <= h:
@@ -81,7 +81,7 @@ def tip_velocity(
     force_gain: Float[Tensor, "*b 3"],
     together: bool = False,
 ) -> Float[Tensor, "*b 3"]:
-    """Return the bracket of Eq. (25) [m/s] for each fingertip, limited to `MAX_SPEED`.
+    """Return the velocity [m/s] of each fingertip, the bracket of Eq. (25), limited to `MAX_SPEED`.
 
     `together` scales all fingers by one factor, so that the ratios of their speeds stay those of Eq. (25).
     """
@@ -96,7 +96,7 @@ def tip_velocity(
 def stay_above(
     velocity: Float[Tensor, "*b 3"], height: Float[Tensor, "*b"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*b 3"]:
-    """Return velocities [m/s] with bounded sinking: fingertips at a height [m] above the table stay above it."""
+    """Return fingertip velocities [m/s], slowed downwards so that tips at `height` [m] stay above the table."""
     lacking = -POSITION_RATE * height.clamp_min(0.0) - velocity @ up
     return velocity + lacking.clamp_min(0.0)[..., None] * up
 
@@ -110,8 +110,8 @@ def joint_step(
 ) -> Float[Tensor, "*b h"]:
     """Return the change of the joints [rad] in one tick, Eq. (25), by damped least squares over all fingers.
 
-    The paper's J^-1 does not exist for coupled fingers or few joints. The null space of the Jacobian reduces
-    `posture_error`, the planned minus the present joints [rad], at `POSITION_RATE`.
+    Coupled fingers and fingers with few joints have no J^-1, as the paper has. In the null space of the Jacobian the
+    joints move towards the planned posture: `posture_error` [rad] is the planned minus the present joints.
     """
     stacked = jacobian.flatten(-3, -2)
     inverse_jacobian = damped_inverse(stacked, damping)

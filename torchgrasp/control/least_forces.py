@@ -23,7 +23,7 @@ PENALTY, KNEE = 500.0, 0.9
 
 
 class Balance(NamedTuple):
-    """The grasp map of contacts, its pseudo-inverse, and k directions of internal forces."""
+    """The grasp map of the contacts, its pseudo-inverse, and a basis of its null space: the k internal forces."""
 
     wrench: Float[Array, "6 n"]
     inverse: Float[Array, "n 6"]
@@ -31,7 +31,7 @@ class Balance(NamedTuple):
 
 
 def balance(points: Float[Array, "f 3"]) -> Balance:
-    """Return grasp map, its pseudo-inverse and its null space at points [m], by one decomposition."""
+    """Return the grasp map at contact points [m], its pseudo-inverse and its null space, from one SVD."""
     wrench = grasp_map(torch.from_numpy(points)).numpy()
     left, values, right = np.linalg.svd(wrench)
     least = 1e-12 * values[0]  # contacts on one line have no greater singular value
@@ -40,17 +40,17 @@ def balance(points: Float[Array, "f 3"]) -> Balance:
 
 
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
-    """Return tangential over normal force, infinite where a finger does not press."""
+    """Return each finger's ratio of tangential to normal force; infinite where a finger does not press."""
     push = -(forces * normals).sum(-1)
     slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
     return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
 
 
 class LeastForces:
-    """A solver of the least forces that starts from the forces of its last call.
+    """A solver for the least fingertip forces; each call starts from the forces of the last call.
 
     Args:
-        start: forces on the object to start from [N]; they press at every contact.
+        start: initial guess of the forces on the object [N]; they press at every contact.
         effort: largest torque of every joint [N m].
         most: largest normal force of a finger [N].
     """
@@ -67,9 +67,9 @@ class LeastForces:
         friction: float,
         floor: Float[Array, "f"],
     ) -> Float[Array, "f 3"]:
-        """Return forces [N] that carry the load, within the friction cones, with normal forces above the floors [N].
+        """Return forces [N] that carry the load, within the friction cones, with normal forces above `floor` [N].
 
-        If the cones cannot be reached, they are widened to the least friction that was found.
+        If no forces within the cones are found, the friction is raised to the least value that was found.
         """
         count = len(normals)
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], self._normal(normals)])
@@ -97,13 +97,13 @@ class LeastForces:
         return max(float(torque.max()), float((-(self.forces * normals).sum(-1)).max()) / self.most)
 
     def _normal(self, normals: Float[Array, "f 3"]) -> Float[Array, "f n"]:
-        """Return the map from stacked forces to normal forces over their limit."""
+        """Return the matrix from stacked forces (3f) to normal forces divided by their limit."""
         count = len(normals)
         return -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
 
 
 class _Barrier:
-    """The objective, over k coordinates z of the forces that balance the load."""
+    """The barrier objective, as a function of k coordinates z of the internal forces."""
 
     def __init__(
         self,
@@ -122,15 +122,14 @@ class _Barrier:
         self.push_0 = -(normals * self.carried.reshape(self.count, 3)).sum(-1)
 
     def place(self, forces: Float[Array, "f 3"], share: float = 1.0) -> Float[Array, " k"]:
-        """Return the coordinates nearest to given forces, less a share of the forces that carry the load."""
+        """Return the coordinates z nearest to given forces, less a `share` of the load-carrying forces."""
         return self.basis.T @ (forces.ravel() - share * self.carried)
 
     def forces(self, z: Float[Array, "*g k"]) -> Float[Array, "*g f 3"]:
-        """Return the forces."""
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
-        """Return the best of several starts; widen the cones and lower the floors as it needs."""
+        """Return the best of several initial guesses; raise the friction and lower the floors if none is feasible."""
         push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
         across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
         ratio = np.where(push > 0, across / np.maximum(push, 1e-12), np.inf).max(-1)
@@ -142,7 +141,7 @@ class _Barrier:
         return tried[int((value if np.isfinite(value).any() else ratio).argmin())]
 
     def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
-        """Return the objective; infinite outside of the cones."""
+        """Return the objective at coordinates z; infinite outside the friction cones."""
         n, t = z @ self.push.T + self.push_0, z @ self.tau.T + self.tau_0
         cone = self.slack * n * n - (self.forces(z) ** 2).sum(-1)
         inside = ((cone > 0) & (n > self.floor)).all(-1)
@@ -152,7 +151,7 @@ class _Barrier:
         return np.where(inside, n.sum(-1) + over - self.gap * logs, np.inf)
 
     def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
-        """Return Newton's step, and its decrement."""
+        """Return Newton's step at coordinates z, and the Newton decrement."""
         gap, push = self.gap, self.push
         n, t, force = push @ z + self.push_0, self.tau @ z + self.tau_0, self.forces(z)
         cone = self.slack * n * n - (force * force).sum(-1)

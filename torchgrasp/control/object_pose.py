@@ -1,8 +1,8 @@
-"""The object-pose estimate from touches: by how much the object is displaced from where the grasp was planned.
+"""The object-pose estimate from touches: how far the object is displaced from its pose in the plan.
 
-`ContactPlanes` serves while the fingers close: it knows the tangent plane of each contact. `Localization` serves a hand
-that stands still: it compares touched points and normals with the estimated surface (tactile localization), so that it
-also finds displacements along the object's own surface.
+While the fingers close, `ContactPlanes` uses the tangent plane at each planned contact. While the hand stands still,
+`Localization` compares touched points and normals with the estimated surface, so that it also finds displacements along
+the object's own surface.
 """
 
 import torch
@@ -21,15 +21,15 @@ PITCH = 0.004  # distance [m] between the displacements that `Localization` trie
 
 
 class ContactPlanes:
-    """The displacement of the object, from the tangent planes of its contacts, in the frame of the undisplaced hand.
+    """Estimate the object's displacement while the fingers close, from the tangent planes at its contacts.
 
     A fingertip that touches measures the offset of its plane, with the variance of the shape (Sigma_cov). A fingertip
-    that is beyond its plane without a touch bounds the offset. The estimate is the likeliest displacement, given a
-    Gaussian prior.
+    that is beyond its plane without a touch bounds the offset. The estimate maximises the posterior density under a
+    Gaussian prior, in the frame of the hand at its planned pose.
 
     Args:
-        reference: contacts of the closing.
-        expected: mean [m, rad] of the prior; None: the object is where it was seen.
+        reference: the closing plan, with the contacts.
+        expected: mean [m, rad] of the prior; None: zero.
     """
 
     def __init__(self, reference: ClosingReference, expected: Float[Tensor, "6"] | None = None) -> None:
@@ -42,11 +42,11 @@ class ContactPlanes:
         self.expected = torch.zeros_like(self.prior[0]) if expected is None else expected
 
     def displacement(self, points: Float[Tensor, "f 3"], touching: Bool[Tensor, "f"]) -> Float[Tensor, "6"]:
-        """Return the likeliest displacement of the contacts' centre [m] and rotation about it [rad].
+        """Return the most probable displacement: translation of the contacts' centroid [m], rotation about it [rad].
 
         Args:
-            points: points [m] of the fingertips that touch first.
-            touching: fingertips that touch.
+            points: the point [m] of each fingertip that is ahead in its contact's direction.
+            touching: which fingertips touch.
         """
         off = ((points - self.target) * self.normals).sum(-1)
         beyond = (off - self.rows @ self.expected).clamp_min(-0.025)  # a finger farther on has missed the object
@@ -64,13 +64,13 @@ class ContactPlanes:
         return found
 
     def moved(self, displacement: Float[Tensor, "6"]) -> Float[Tensor, "f 3"]:
-        """Return the contacts of the displaced object [m]."""
+        """Return the planned contact points [m] after a displacement [m, rad] of the object."""
         shift, turn = displacement[:3], displacement[3:]
         return self.target + shift + torch.linalg.cross(turn.expand_as(self.arms), self.arms)
 
 
 def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
-    """Return the inverse covariance of displacements: an object moves along its table and turns about its normal."""
+    """Return the prior's inverse covariance: an object moves along its table and turns about the table's normal."""
     shift_std, height_std, turn_std, tilt_std = 0.01, 0.001, 0.09, 0.01  # [m, m, rad, rad]
     eye = torch.eye(3, dtype=reference.normals.dtype)
     place, turn = eye / shift_std**2, eye / turn_std**2
@@ -83,9 +83,9 @@ def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
 
 
 class Touches:
-    """Touched points and normals of a hand at rest, averaged over time, in the frame of the hand's planned pose.
+    """Averages over time of the points and normals that a resting hand touches, in the frame of its planned pose.
 
-    `known` are fingertips with a working sensor, `felt` those that reported the place of a contact.
+    `known` marks fingertips with a working sensor, `felt` fingertips that reported where they touch.
     """
 
     def __init__(self, reference: ClosingReference) -> None:
@@ -95,7 +95,7 @@ class Touches:
         self.contact = torch.zeros_like(self.known)
 
     def add(self, observation: Observation, palm: Float[Tensor, "3"]) -> None:
-        """Add one observation to the averages; `palm` is the displacement [m] of the palm."""
+        """Add one observation to the averages; `palm` [m] is how far the palm is displaced from its plan."""
         sensed = observation.tactile
         placed = torch.isfinite(sensed.points).all(-1) & torch.isfinite(sensed.normals).all(-1) & sensed.contact
         self.points = self.points + torch.where(placed[:, None], sensed.points + palm, 0.0)
@@ -105,18 +105,18 @@ class Touches:
 
     @property
     def felt(self) -> Bool[Tensor, "f"]:
-        """Fingertips that still touch and reported the place of their contact."""
+        """Which fingertips still touch and have reported where."""
         return self.contact & (self.count > 0)
 
     def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """Return mean points [m] and normals of the contacts; zero where nothing was felt."""
+        """Return mean contact points [m] and normals; zero for fingertips that reported no contact."""
         return self.points / self.count.clamp_min(1)[:, None], unit(self.normals)
 
 
 class Localization:
-    """A search for the displacement at which the touches fit the estimated surface best; each call tries one turn.
+    """Search for the object displacement that best explains the touches; each call tries one rotation angle.
 
-    `displacement` is the motion of the contacts' centre [m] and the rotation about it [rad], as of `ContactPlanes`.
+    `displacement` holds the translation of the contacts' centroid [m] and the rotation about it [rad].
     """
 
     def __init__(self, reference: ClosingReference) -> None:
@@ -133,16 +133,16 @@ class Localization:
 
     @property
     def done(self) -> bool:
-        """Whether all turns were tried."""
+        """Whether all rotation angles were tried."""
         return self.step >= len(TURNS) + len(FINE_TURNS)
 
     @property
     def displacement(self) -> Float[Tensor, "6"]:
-        """The best displacement so far [m, rad]."""
+        """The best object displacement so far [m, rad]."""
         return torch.cat([self.shift @ self.axes, self.turn * self.up])
 
     def __call__(self, touches: Touches) -> None:
-        """Try one turn; the last calls try turns and displacements close to the best."""
+        """Try one rotation angle with a grid of translations; the last calls refine the best."""
         if self.step < len(TURNS):
             shifts, turn = _square(0.032, PITCH), TURNS[self.step]
         else:
@@ -158,7 +158,7 @@ class Localization:
         self.step += 1
 
     def _costs(self, touches: Touches, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
-        """Return the negative logarithms of the likelihoods of displacements."""
+        """Return the negative log-likelihood of each translation [m] along the table, for one rotation [rad]."""
         surface_std, normal_std, shift_std, turn_std = 0.004, 0.3, 0.02, 0.15  # [m, 1, m, rad]
         gap, worst = 0.001, 20.0  # least distance [m] of a tip in the air; bound on the cost of one tip
         felt, (points, normals) = touches.felt, touches.means()
@@ -175,6 +175,6 @@ class Localization:
 
 
 def _square(half: float, pitch: float) -> Float[Tensor, "m 2"]:
-    """Return points of a square grid from -half to half along both axes."""
+    """Return the points of a square grid with spacing `pitch` from -half to half on both axes [m]."""
     line = torch.arange(-round(half / pitch), round(half / pitch) + 1, dtype=torch.float64) * pitch
     return torch.cartesian_prod(line, line)

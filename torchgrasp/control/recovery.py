@@ -1,6 +1,6 @@
-"""Recovery from a wrong object pose: the guarded approach stops at a touch, and the regrasp closes a second time.
+"""Recovery when the object is not where it was seen: a guarded approach that stops at a touch, and a regrasp.
 
-Both locate the object from touches (`Localization`) and move the palm to it.
+Both locate the object from touches (`Localization`) and move the palm to the object.
 """
 
 import math
@@ -30,22 +30,22 @@ OPENING_TIME = 0.5  # time [s] in which the fingers open
 
 
 def can_guard(reference: ClosingReference) -> bool:
-    """Return whether a guarded move is possible: table and surface are known, and fingertips feel where they touch."""
+    """Return whether a guarded approach is possible: table and surface are known, fingertips sense where they touch."""
     known = reference.approach is not None and reference.table is not None and reference.surface is not None
     return known and reference.sensor.kind == "tactile"
 
 
 class GuardedApproach:
-    """A guarded move of the opened hand to its pre-grasp: it stops when a fingertip touches.
+    """Move the opened hand to its pre-grasp, and stop when a fingertip touches (a guarded move).
 
-    The hand averages the touch, locates the object, draws back, displaces its palm and goes on. After the last allowed
-    stop the hand goes on regardless of touches.
+    After a stop the hand averages the touch, locates the object, retreats, moves its palm sideways and goes on. After
+    the last allowed stop it ignores touches.
 
-    `left` [m] is the remaining approach, `palm` [m] the displacement of the palm, `stops` the number of stops, and
-    `displacement` [m, rad] the object's, as the last touch located it.
+    `left` [m] is the remaining approach, `palm` [m] the palm's displacement from its planned path, `stops` the number
+    of stops, `displacement` [m, rad] the object's displacement at the last touch.
 
     Args:
-        reference: plan of a closing for which `can_guard` holds.
+        reference: a closing plan for which `can_guard` is true.
         options: how often the hand stops, and how far its palm moves.
         length: length [m] of the approach.
     """
@@ -84,7 +84,7 @@ class GuardedApproach:
             self.left = max(self.left - self.speed * period, 0.0)
 
     def _feel(self, observation: Observation, period: float) -> None:
-        """Average the touch, then locate the object; finally choose where the palm goes."""
+        """Average the touch, then locate the object, then choose the new goal of the palm."""
         if self.time < 0.06:  # [s]
             self.time += period
             self.touches.add(observation, self.palm - self.left * self.direction)
@@ -99,15 +99,15 @@ class GuardedApproach:
 
 
 class GraspCheck:
-    """The judgement of a pressing hand: `judged` tells whether it is made, `secure` whether the hand may be lifted.
+    """Judge a pressing grasp: `judged` turns true when the result is known, `secure` says whether to lift.
 
-    `displacement` [m, rad] is the object's. Without an estimated surface it stays the closing's.
+    `displacement` [m, rad] of the object is located anew from the touches if the surface was estimated.
 
     Args:
-        reference: plan of the closing.
+        reference: the closing plan.
         displacement: displacement of the object [m, rad] that the closing estimated.
-        palm: displacement of the palm [m].
-        last: whether no attempt is left; then every grasp counts as secure.
+        palm: displacement of the palm from its plan [m].
+        last: whether this is the last attempt; its grasp always counts as secure.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class GraspCheck:
         self.judged = self.secure = last
 
     def __call__(self, observation: Observation, pressed: float) -> None:
-        """Average the contacts, locate the object, and judge once the hand has `pressed` [s] long enough."""
+        """Average the touches, locate the object, and judge after `PRESSING_TIME`; `pressed` [s] is the time so far."""
         if self.judged or pressed < 0.1:
             return
         if pressed < 0.3:
@@ -146,14 +146,14 @@ class GraspCheck:
 
 
 class Reopening:
-    """Open the hand and move its palm to the object; `done` when the hand may close again.
+    """Open the hand and move its palm to the displaced object; `done` says when the hand may close again.
 
     Args:
-        reference: plan of the closing.
+        reference: the closing plan.
         displacement: displacement of the object [m, rad].
         joints: present targets of all joints [rad].
         palm: present displacement of the palm [m].
-        reach: farthest displacement of the palm [m]; 0: the arm does not yield.
+        reach: largest displacement of the palm [m]; 0: the palm does not move.
     """
 
     def __init__(
@@ -170,11 +170,11 @@ class Reopening:
 
     @property
     def done(self) -> bool:
-        """Whether the hand is open and has come to rest."""
+        """Whether the hand is open and at rest."""
         return self.time >= OPENING_TIME + 0.1
 
     def __call__(self, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick: first the fingers open, then the palm moves."""
+        """Return the targets of all joints [rad] for the next tick: first the fingers open, then the palm moves."""
         if self.time >= OPENING_TIME and not torch.equal(self.palm, self.goal):
             self.palm = next_palm(self.palm, self.goal, period)
         else:
@@ -183,7 +183,7 @@ class Reopening:
 
 
 def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> Float[Tensor, "3"]:
-    """Return where a palm follows an object displaced by `shift`: along the table, at most `reach` [m] away."""
+    """Return the palm displacement [m] that follows an object's `shift`: along the table, at most `reach`."""
     if table is not None:
         up = unit(table.normal)
         shift = shift - (shift @ up) * up
@@ -191,6 +191,6 @@ def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> F
 
 
 def next_palm(palm: Float[Tensor, "3"], goal: Float[Tensor, "3"], period: float) -> Float[Tensor, "3"]:
-    """Return the displacement of a palm [m] a period [s] later, on its straight way to a goal."""
+    """Return the palm displacement [m] one tick later, on a straight line to its goal at `PALM_SPEED`."""
     way, longest = goal - palm, PALM_SPEED * period
     return goal if float(torch.linalg.vector_norm(way)) <= longest else palm + limit_norm(way, longest)

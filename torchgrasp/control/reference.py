@@ -1,4 +1,4 @@
-"""The plan of one closing: poses, contacts and gains of a grasp, derived once in the hand's frame."""
+"""The closing plan: poses, contacts and controller gains of one grasp in the hand's frame."""
 
 import dataclasses
 import functools
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingReference(Value):
-    """What a closing hand follows, in the hand's frame; joints are actuated [rad].
+    """The plan that a closing hand follows, in the hand's frame; joints are the actuated joints [rad].
 
     Args:
         hand: the hand, in float64.
@@ -54,11 +54,11 @@ class ClosingReference(Value):
         obj_from_hand: planned pose of the hand in the frame of the grasp.
         pregrasp: joints of the opened hand.
         joints: joints of the grasp.
-        squeeze: joint targets that press in open loop (`squeeze`).
+        squeeze: joint targets that press without feedback, from `squeeze`.
         normals: outward normals of the planned contacts.
         gains: contacts, gains and desired forces (Eqs. 26-28).
         approach: unit vector along which the opened hand moves to its pre-grasp; None: no approach.
-        table: no fingertip presses into this plane while it searches; None: unknown.
+        table: the table, which no fingertip enters while it searches; None: unknown.
         surface: estimated surface of the object in the frame of the grasp (`surface_field`), which locates the object
             from touches; None: the tangent planes of the contacts are used.
         sensor: sensors of the fingertips.
@@ -97,7 +97,7 @@ class ClosingReference(Value):
         kp: Positive | None = None,
         stability: "StabilityModel | None" = None,
     ) -> "ClosingReference":
-        """Derive the reference of one grasp, on the CPU.
+        """Derive the closing plan of one grasp, on the CPU.
 
         Args:
             hand: the hand.
@@ -155,22 +155,22 @@ class ClosingReference(Value):
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
-        """Return all joints of the URDF; NaN is allowed."""
+        """Return all joints of the URDF from the actuated joints [rad]; NaN is allowed."""
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
-        """Return the actuated joints out of all joints of the URDF; NaN is allowed."""
+        """Return the actuated joints from all joints of the URDF [rad]; NaN is allowed."""
         return joints[self._actuated]
 
     @functools.cached_property
     def _actuated(self) -> list[int]:
-        """Indices of the actuated joints among all joints."""
+        """Indices of the actuated joints among all joints of the URDF."""
         return [self.hand.tree.joint_names.index(name) for name in self.hand.joint_names]
 
     @property
     def alive(self) -> Bool[Tensor, "f"]:
-        """Which fingertips have a working sensor.
+        """Whether each fingertip has a working sensor.
 
         Raises:
             BadArgument: the sensor names a dead finger that the hand does not have.
@@ -182,17 +182,17 @@ class ClosingReference(Value):
 
     @checked
     def clamp(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " h"]:
-        """Return the joints clamped to their limits."""
+        """Return actuated joints [rad] clamped to their limits."""
         return torch.minimum(torch.maximum(actuated, self.hand.lower), self.hand.upper)
 
     @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-        """Return the points [m] of fingertips with given centres [m] that touch first."""
+        """Return where fingertips with given centres [m] would touch: one tip radius towards the contact."""
         return tips - self.hand.tips.radius[:, None] * self.normals
 
 
 def check_single(grasp: Grasps) -> None:
-    """Refuse more or fewer grasps than one."""
+    """Raise `BadArgument` unless there is exactly one grasp."""
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
 
@@ -216,7 +216,7 @@ def next_target(
 
 
 def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:
-    """Return the approach direction of one grasp in the hand's axes."""
+    """Return the unit approach direction of one grasp in the hand's frame; None: no approach."""
     direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
     return unit(direction) if bool((direction != 0.0).any()) else None
 

@@ -1,6 +1,6 @@
-"""Fingertips with poorer sensors than tactile ones: binary contacts, joint torques, delays, noise and dead sensors.
+"""Simpler fingertip sensors than tactile ones: binary contact or joint torques, with delay, noise and dead sensors.
 
-A robot with such sensors makes its `TactileState` by `feel_flags` or `feel_torques`, instead of `measure`.
+A robot with such sensors makes its `TactileState` with `feel_flags` or `feel_torques` instead of `measure`.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ TORQUE_NOISE = 0.01  # standard deviation [N m] of a sensed joint torque
 
 @checked
 def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileState:
-    """Return the readings of fingertips that sense only whether they touch.
+    """Return the tactile state of fingertips that sense only whether they touch.
 
     >>> feel_flags(no_contact(), torch.tensor([True, False, False])).reading
     tensor([0.3000, 0.0000, 0.0000], dtype=torch.float64)
@@ -52,11 +52,11 @@ def feel_torques(
     torques: Float[Tensor, " j"],
     period: Positive,
 ) -> TactileState:
-    """Return the readings of fingertips whose forces are estimated from joint torques.
+    """Return the tactile state of fingertips whose forces are estimated from joint torques.
 
     Args:
-        tactile: readings before.
-        reference: what the hand follows; the normals give the direction in which a finger presses.
+        tactile: the state at the last tick.
+        reference: the closing plan; its normals give the direction in which a finger presses.
         jacobian: Jacobian of the fingertips by all joints [m/rad], as in `Observation`.
         torques: torques of all joints [N m] from contacts: without weight, friction and acceleration.
         period: time since the last readings [s].
@@ -85,7 +85,7 @@ def feel_torques(
 
 
 def _forces_by_torques(reference: ClosingReference, jacobian: Float[Tensor, "f 3 j"]) -> Float[Tensor, "f 3 j"]:
-    """Return the map from torques to the likeliest forces: the mean of a Gaussian with a prior of contact forces.
+    """Return the linear map from joint torques [N m] to the most probable contact forces [N] under a Gaussian prior.
 
     The prior suppresses directions that the torques barely observe.
     """
@@ -96,13 +96,13 @@ def _forces_by_torques(reference: ClosingReference, jacobian: Float[Tensor, "f 3
 
 
 def _pushes(reference: ClosingReference, forces: Float[Tensor, "f 3"]) -> TipContact:
-    """Return contacts with forces at unknown places."""
+    """Return contacts with given forces [N]; their places are unknown (NaN)."""
     push, nothing = -(forces * reference.normals).sum(-1), torch.full_like(forces, torch.nan)
     return TipContact(push.clamp_min(0.0), forces, nothing, nothing)
 
 
 class DriveFeel:
-    """Contact forces from the drives alone: a joint that does not reach its target is pushed against.
+    """Estimate contact forces from the drives alone: a blocked joint does not reach its target.
 
     A drive of stiffness k and damping d exerts k (target - q) - d dq/dt.
     """
@@ -115,7 +115,7 @@ class DriveFeel:
         self.pushes = torch.zeros_like(reference.normals[:, 0])
 
     def __call__(self, observation: Observation, targets: Float[Tensor, " j"], period: float) -> Float[Tensor, "f"]:
-        """Return how hard each fingertip presses [N], averaged as for a contact flag, by the targets of the tick."""
+        """Return the low-passed normal force [N] of each fingertip, given the joint targets [rad] of the tick."""
         joints = observation.joints
         torques = self.reference.kp * (targets - joints) - self.damping * (joints - self.before) / period
         self.before = joints
@@ -126,10 +126,10 @@ class DriveFeel:
 
 
 class FingertipSensor:
-    """Simulated fingertips of a `SensorModel`.
+    """Simulate the fingertip sensors that a `SensorModel` describes.
 
     Args:
-        reference: what the hand follows, with its sensor.
+        reference: the closing plan, with the sensor model.
         generator: draws the noise; None: no noise.
 
     >>> from torchgrasp import load_hand
@@ -151,7 +151,7 @@ class FingertipSensor:
         self.alive = reference.alive
 
     def __call__(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"], period: float) -> TactileState:
-        """Return the readings a tick later.
+        """Return the readings one tick later.
 
         Args:
             truth: true contacts during the tick.
@@ -176,7 +176,7 @@ class FingertipSensor:
         return self.reports[0]
 
     def _torques(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"]) -> Float[Tensor, " j"]:
-        """Return the torques [N m] that contacts cause at all joints, with the noise of the sensors."""
+        """Return the torques [N m] of all joints that contacts cause, with the noise of the sensors."""
         torques = torch.einsum("fcj,fc->j", jacobian, truth.forces)
         if self.generator is not None:
             drawn = torch.randn(len(torques), generator=self.generator, dtype=torques.dtype)
@@ -185,7 +185,7 @@ class FingertipSensor:
 
 
 def _silence(tactile: TactileState, alive: Bool[Tensor, "f"]) -> TactileState:
-    """Return readings in which the dead fingertips feel nothing."""
+    """Return a tactile state in which the dead fingertips feel nothing."""
     quiet, row = no_contact(fingers=len(alive)), alive[:, None]
     return dataclasses.replace(
         tactile,

@@ -1,4 +1,4 @@
-"""Observations of a hand, and tactile fingertips: their readings, noise, lag and sampling."""
+"""Observations of a hand, and simulated tactile fingertips with noise, lag and sampling."""
 
 import dataclasses
 import math
@@ -54,7 +54,7 @@ class TactileState(Value):
         contact: whether the fingertip touches.
         points, normals: place [m] and outward normal of the contact; NaN without contact.
         lagged: low-passed normal force [N], full force [N] and sliding speed [m/s].
-        average: slow mean of the normal force [N].
+        average: low-passed normal force [N] that sets the contact flag.
         sliding: sliding speed [m/s].
         age: time [s] since the last sample.
 
@@ -75,7 +75,7 @@ class TactileState(Value):
 
 @checked
 def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
-    """Return the state of fingertips in the air whose next sample is due.
+    """Return the tactile state of fingertips that touch nothing; the next tick samples them.
 
     >>> no_contact().contact
     tensor([False, False, False])
@@ -96,12 +96,12 @@ def measure(
     generator: torch.Generator | None = None,
     noise: Annotated[float, Range(0.0, 100.0)] = 1.0,
 ) -> TactileState:
-    """Return the readings of the fingertips one tick later.
+    """Return the tactile state one tick later.
 
     Args:
-        tactile: readings before.
+        tactile: the state at the last tick.
         truth: true contacts during the tick.
-        pads: outward normals of the surface that the pads face; they direct the noise of a tip in the air.
+        pads: outward surface normals at the planned contacts: the direction of the noise of a tip in the air.
         radius: radius of the tips [m]; 0: not round, 12 mm is assumed.
         period: period of the tick [s].
         generator: draws the noise; None: no noise.
@@ -144,21 +144,21 @@ def measure(
 
 
 def flag(before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: Float[Tensor, "f"] | float) -> Tensor:
-    """Return contact flags with hysteresis; `factor` scales the thresholds with the sensor's noise."""
+    """Return contact flags with hysteresis; `factor` scales the thresholds by the sensor's noise."""
     return torch.where(before, average > 0.5 * TOUCH_ON * factor, average > TOUCH_ON * factor)
 
 
 def low_pass(cutoff: float, period: float) -> float:
-    """Return the new value's share in a first-order low-pass, given cut-off [Hz] and period [s]."""
+    """Return the weight of the new value in a first-order low-pass filter, given cut-off [Hz] and period [s]."""
     return 1 - math.exp(-2 * math.pi * cutoff * period)
 
 
 class Targets(NamedTuple):
-    """Commands until the next tick.
+    """Commands to hand and arm until the next tick.
 
     Args:
         joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
-        palm: displacement of the palm [m] from its path, in the axes of the hand. The wrist does not turn.
+        palm: displacement of the palm [m] from its planned path, in the hand's axes; the palm does not rotate.
         left: remaining length [m] of the approach; 0: the hand is at its pre-grasp.
 
     >>> Targets(torch.zeros(16)).palm
@@ -173,12 +173,12 @@ class Targets(NamedTuple):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Observation(Value):
-    """Joints, fingertips and touch at a tick, in the hand's frame.
+    """What a hand measures at a tick, in the hand's frame.
 
     Args:
         joints: all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
         tips: centres of the fingertips [m].
-        jacobian: of these centres by all joints [m/rad].
+        jacobian: Jacobian of these centres by all joints [m/rad].
         tactile: readings of the fingertips.
 
     >>> from torchgrasp import load_hand
@@ -196,7 +196,7 @@ class Observation(Value):
 
 @checked
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
-    """Return the observation of a robot with measured actuated joints [rad] and fingertip readings.
+    """Return the observation of a robot, from its measured actuated joints [rad] and fingertip readings.
 
     Raises:
         BadArgument: joints or fingertips on another device than the hand.
@@ -215,7 +215,7 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
 
 
 def joint_jacobian(hand: Hand, joints: Float[Tensor, " j"], points: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3 j"]:
-    """Return the Jacobian of points on the fingertips [m/rad] by all joints of the URDF, each on its own."""
+    """Return the Jacobian [m/rad] of points on the fingertips by each URDF joint, as if no joints were coupled."""
     axes, origins = hand.tree.joint_axes(hand.tree.poses(joints[None])[0])
     turning = torch.linalg.cross(axes.expand(len(points), -1, 3), points[:, None] - origins)
     columns = torch.where(hand.tree.prismatic[:, None] > 0, axes, turning)

@@ -28,7 +28,7 @@ LEAD = 0.04
 
 
 class UncertaintyClosing:
-    """The paper's control law with extensions.
+    """The default closing controller: the paper's control law (Eqs. 25-28) with extensions.
 
     * A finger in the air searches along its contact's normal, even beyond the contact, but not below the table. A
       finger that touches is force-controlled, whatever its position error.
@@ -38,8 +38,8 @@ class UncertaintyClosing:
     * The components of `ClosingOptions` that act while the fingers close: `wait`, `pose_estimate` and `palm_reach`.
 
     Args:
-        reference: contacts, gains and sensors.
-        options: components of the closing.
+        reference: the closing plan, with contacts, gains and sensors.
+        options: which extensions are on.
     """
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:
@@ -59,13 +59,13 @@ class UncertaintyClosing:
         return self.settled.time >= SETTLED or (self.waits and self.waiting >= PATIENCE)
 
     def begin_at(self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]) -> "UncertaintyClosing":
-        """Start with a displaced palm [m], and expect the object displaced [m, rad] from where it was seen."""
+        """Start with a displaced palm [m]; the prior mean of the object's displacement is `displacement` [m, rad]."""
         self.planes, self.palm = ContactPlanes(self.reference, displacement), palm
         self.displacement = displacement
         return self
 
     def press(self) -> "UncertaintyClosing":
-        """Let waiting fingers press with their desired forces, and keep the palm where it is."""
+        """Let the fingers that wait press with their desired forces, and keep the palm where it is."""
         self.waits, self.reach = False, 0.0
         return self
 
@@ -103,7 +103,7 @@ class UncertaintyClosing:
         return reference.expand(self.target)
 
     def _follow(self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]) -> tuple[Tensor, Tensor]:
-        """Return the contacts [m] of the estimated object (f, 3), and the velocity [m/s] of the palm."""
+        """Return the contact points [m] on the displaced object (f, 3), and the velocity [m/s] of the palm."""
         if self.planes is None:
             return self.reference.gains.target, STILL
         self.displacement = self.planes.displacement(points, contact)
@@ -116,7 +116,7 @@ class UncertaintyClosing:
     def _without_sensor(
         self, observation: Observation, ahead: Float[Tensor, "f"], contact: Bool[Tensor, "f"], period: float
     ) -> tuple[Bool[Tensor, "f"], Bool[Tensor, "f"]]:
-        """Return which fingers without a sensor probably touch, and which rest until the others touch."""
+        """Return which fingers without a sensor probably touch, and which stop until the others touch."""
         blind = ~self.alive
         if self.drives is None:
             return blind, blind
@@ -130,7 +130,7 @@ class UncertaintyClosing:
     def _desired(
         self, reading: Float[Tensor, "f"], contact: Bool[Tensor, "f"], rests: Bool[Tensor, "f"]
     ) -> Float[Tensor, "f"]:
-        """Return the desired normal forces [N]; fingers without a sensor get their reading: no force error."""
+        """Return the desired normal force [N] of each finger; without a sensor the force error is zero."""
         desired = -(self.reference.gains.desired_force * self.reference.normals).sum(-1)
         if self.waits:
             rest = WAITING_FORCE if bool(contact.all()) else reading.clamp_max(WAITING_FORCE)
@@ -140,7 +140,7 @@ class UncertaintyClosing:
     def _count(
         self, observation: Observation, touched: Bool[Tensor, "f"], share: Float[Tensor, "f"], period: float
     ) -> None:
-        """Count the time since the first touch, and the time for which the fingers have settled."""
+        """Update the time since the first touch, and the time for which all fingers have been settled."""
         self.share = share
         self.waiting = self.waiting + period if bool(touched.any()) else 0.0
         touching = observation.tactile.contact | (touched & ~self.alive)
@@ -148,7 +148,7 @@ class UncertaintyClosing:
 
 
 def with_equal_gains(reference: ClosingReference) -> ClosingReference:
-    """Return a reference with equal gains for every contact and direction: the closing "fixed" ignores uncertainty."""
+    """Return the plan with equal gains at all contacts, for the closing "fixed", which ignores uncertainty."""
     gains = reference.gains
     isotropic = dataclasses.replace(
         gains,

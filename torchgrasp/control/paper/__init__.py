@@ -1,1 +1,1 @@
-"""The paper's control law and baselines, learned stability and object-level impedance. Not public."""
+"""Baselines: the paper's control law, position control, object-level impedance and learned grasp stability."""

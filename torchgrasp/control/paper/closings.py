@@ -1,4 +1,4 @@
-"""Closings to compare with: the paper's control law (Eqs. 25-28) and position control, open loop, impedance."""
+"""Baseline closing controllers: the paper's law (Eqs. 25-28), position control and open loop; impedance hold."""
 
 import math
 
@@ -26,10 +26,10 @@ GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the 
 
 
 class PaperClosing:
-    """The paper's control law as written, and what it needs to run: a damped inverse and limits of gain and speed.
+    """The paper's control law (Eqs. 25-28), with a damped inverse and limits of gain and speed.
 
-    A target leads its joint by no more than the drive can exert. The closing ends when all fingers touch, each blend
-    (Eq. 26) is at least 0.5, and the forces have been steady for `SETTLED` seconds.
+    No joint target leads its joint by more than the drive can exert. The closing ends when all fingers touch, each
+    blend (Eq. 26) is at least 0.5, and the forces have been steady for `SETTLED` seconds.
     """
 
     palm = STILL
@@ -46,7 +46,7 @@ class PaperClosing:
         return self.settled.time >= SETTLED
 
     def press(self) -> "PaperClosing":
-        """Return the closing itself: it presses from the start."""
+        """Return the closing controller itself: the paper's law presses from the start."""
         return self
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
@@ -63,7 +63,7 @@ class PaperClosing:
 
 
 class Settled:
-    """The `time` [s] for which all fingers have touched, where they should be, with steady forces."""
+    """The `time` [s] for which all fingers have touched near their planned contacts with steady forces."""
 
     def __init__(self, reference: ClosingReference) -> None:
         self.time, self.steady = 0.0, torch.zeros_like(reference.normals[:, 0])
@@ -76,7 +76,7 @@ class Settled:
         period: float,
         pressing: bool = True,
     ) -> None:
-        """Count a tick; without `pressing` the touches alone count."""
+        """Update the time by one tick; without `pressing` it is enough that all fingers touch."""
         average = observation.tactile.average
         settled = bool(touching.all())
         if pressing:
@@ -95,9 +95,9 @@ def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
 
 
 class PositionClosing:
-    """The paper's baseline (Table 7): a PI position controller per fingertip that stops at `STOP_FORCE`.
+    """The paper's baseline (Table 7): a PI position controller for each fingertip, stopped at `STOP_FORCE`.
 
-    It aims at a `depth` [m] behind the contacts. The paper's depth is 0: a finger may stop before it touches.
+    The goal lies `depth` [m] behind the planned contact. The paper's depth is 0: a finger may stop before it touches.
     """
 
     palm = STILL
@@ -128,7 +128,7 @@ class PositionClosing:
 
 
 class OpenLoopClosing:
-    """Move from pre-grasp to grasp to squeeze and ignore all sensors."""
+    """Move the joints from pre-grasp to grasp to squeeze targets, without any sensor."""
 
     palm = STILL
 
@@ -148,9 +148,9 @@ class OpenLoopClosing:
 
 
 def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:
-    """Return force [N] and torque [N m] that restore the virtual frame to its pose at rest.
+    """Return the spring's force [N] and torque [N m] that pull the fingertips' frame back to its rest pose.
 
-    The torque is proportional to the sine of the rotation error.
+    The frame is the virtual frame of three fingertips (Eq. 18); the torque grows with the sine of the rotation error.
     """
     axes, desired = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
     error = 0.5 * torch.linalg.cross(axes, desired).sum(-2)
@@ -161,7 +161,7 @@ def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, 
 def shared_forces(
     points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the smallest forces that exert a wrench, scaled so that none exceeds `most` [N]."""
+    """Return the smallest fingertip forces that exert a wrench, scaled so that none exceeds `most` [N]."""
     forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
     largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
@@ -170,24 +170,24 @@ def shared_forces(
 def spring_forces(
     points: Float[Tensor, "*b 3 3"], lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the balanced forces of springs [N/m] along the sides of a triangle, at rest at `lengths` [m]."""
+    """Return the forces [N] of springs along the sides of the triangle of fingertips, with rest `lengths` [m]."""
     return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
 
 
 def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the lengths of the sides (0, 1), (1, 2) and (2, 0) of a triangle [m]."""
+    """Return the lengths [m] of the sides (0, 1), (1, 2) and (2, 0) of a triangle."""
     return torch.linalg.vector_norm(points.roll(-1, dims=-2) - points, dim=-1)
 
 
 class Impedance:
-    """Hold the object as a spring in the hand, by joint targets q + J^T f / kp.
+    """Hold the object like a spring between the fingertips: object-level impedance, by joint targets q + J^T f / kp.
 
-    At rest the forces are the desired ones, balanced at the sensed contacts. Null-space motions of the joints are
-    suppressed. A grasp that the stability model judges unstable becomes firmer and stiffer, and stays so.
+    At rest the forces are the desired forces, balanced at the sensed contacts. Null-space motions of the joints are
+    suppressed. If the stability model judges the grasp unstable, forces and stiffness rise and stay high.
 
     Args:
         reference, observation, start: as for `ForceHold`.
-        springs: stiffness [N/m] along the `side_lengths`; None: `GRASP_STIFFNESS`.
+        springs: stiffness [N/m] along each side of the triangle of fingertips; None: `GRASP_STIFFNESS`.
         stability: model of the hand's stable grasps; None: the grasp does not adapt.
     """
 
@@ -227,7 +227,7 @@ class Impedance:
         return self.reference.expand(posture + drift + self.lead + share * (lead - self.lead))
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """Make an unstable grasp firmer, and as stiff as stable grasps of these lengths."""
+        """If the grasp is unstable, raise its forces, and its stiffness to that of stable grasps of the same size."""
         if self.stability is None or self.time < RAMP + 0.3:  # the filtered readings must have followed the forces
             return
         state = state_of(self.springs, lengths_of(observation.tips), self.reading)
@@ -247,12 +247,12 @@ class Impedance:
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
 
     def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-        """Return the virtual frame, or the last frame if the tips are on a line."""
+        """Return the virtual frame of the fingertips, or the last one if the tips are on a line."""
         if not bool(degenerate(tips)):
             self.frame = virtual_frame(tips)
         return self.frame
 
     def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
-        """Return the actuated joints nearest to all joints, weighted by stiffness."""
+        """Return the actuated joints [rad] that best fit all joints, weighted by stiffness."""
         weighted = self.coupling * self.reference.kp[:, None]
         return weighted.T @ (joints - self.reference.hand.actuated.offset) / self.stiffness

@@ -1,8 +1,8 @@
-"""The stability model [6]: Gaussian mixtures over stiffness, lengths and tactile forces of grasps.
+"""The learned stability model [6]: Gaussian mixtures over stiffness, size and tactile forces of grasps.
 
-`scripts/train.py stability` fits them to simulated pulls. The mixture of stable grasps gives their forces, Sigma_fd of
-Eq. (28) included. The stability of a grasp follows from Bayes' rule with a second mixture, of unstable grasps: the
-density of stable grasps alone, as in [6], is low for rare objects, too.
+`scripts/train.py stability` fits two mixtures to simulated pulls, of stable and of unstable grasps. The first gives the
+forces of stable grasps and Sigma_fd of Eq. (28). Both give the probability of stability by Bayes' rule: the density of
+stable grasps alone, as in [6], is low for rare objects, too.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return the state (`NAMES`) of springs [N/m], `lengths_of` tips [m] and forces [N]."""
+    """Return the state of a grasp, logarithms of springs [N/m], tip distances (`lengths_of`) [m] and forces [N]."""
     return torch.cat([springs, lengths, forces.clamp_min(LEAST_FORCE)], -1).log()
 
 
@@ -51,7 +51,7 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PreferredForces(Value):
-    """Normal forces of stable grasps [N], their covariance [N^2], and spring stiffness [N/m]."""
+    """Normal forces [N] of stable grasps, their covariance [N^2], and the stiffness [N/m] of the springs."""
 
     forces: Float[Tensor, "3"]
     covariance: Float[Tensor, "3 3"]
@@ -61,16 +61,16 @@ class PreferredForces(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class StabilityModel(Value):
-    """Densities of the states of stable and of all other grasps of a hand.
+    """Two Gaussian mixtures over grasp states of one hand: stable grasps, and all other grasps.
 
     Args:
         stable: density of the states of stable grasps.
         others: density of the states of all other grasps.
-        share: share of the trials that were stable.
+        share: fraction of training trials that were stable: the prior probability.
         meta: hand, bodies, trials, seed, and the scores on held-out bodies.
 
     Raises:
-        BadArgument: other names, or a share outside (0, 1).
+        BadArgument: mixtures over other variables, or a share outside (0, 1).
     """
 
     stable: GaussianMixture
@@ -79,14 +79,13 @@ class StabilityModel(Value):
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
-        """Check the names."""
         for mixture in (self.stable, self.others):
             if mixture.names != NAMES:
                 raise BadArgument("names", mixture.names, ", ".join(NAMES))
 
     @checked
     def preferred_forces(self, tips: Float[Tensor, "3 3"], force: Positive | None = None) -> PreferredForces:
-        """Return the forces of stable grasps of the same lengths [6].
+        """Return forces and stiffness of stable grasps with the same distances between fingertips [6].
 
         Args:
             tips: centres of the fingertips [m], in any frame.
@@ -120,7 +119,7 @@ class StabilityModel(Value):
 
     @functools.cached_property
     def _without_lengths(self) -> tuple[GaussianMixture, GaussianMixture]:
-        """The densities of stiffness and forces."""
+        """The two mixtures, marginalised over the distances between fingertips."""
         return self.stable.marginal((*STIFFNESS, *FORCES)), self.others.marginal((*STIFFNESS, *FORCES))
 
     @checked
