@@ -99,8 +99,8 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
         pose = of_view.entries().get("T_object_camera")
         if pose is None:
             raise of_view.wrong('an object with "T_object_camera"')
-        rows = [[x.number(-MOST_METRES, MOST_METRES) for x in row.items(4)] for row in pose.items(4)]
-        if [len(row) for row in rows] != [4, 4, 4, 4]:
+        rows = [row.numbers(4, -MOST_METRES, MOST_METRES) for row in pose.items(4)]
+        if len(rows) != 4:
             raise pose.wrong("4 rows of 4 numbers")
         views[view] = tuple(row[3] for row in rows[:3])
     scale, mass, family, group = (fields.get(key) for key in ("suggested_scale", "mass_kg", "family", "group"))

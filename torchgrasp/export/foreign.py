@@ -112,7 +112,7 @@ def _read_own(rows: Field, hand: Hand) -> ForeignGrasps:
             values.append([_entry(posture, name, row).number(-FAR, FAR) for name in hand.joint_names])
         pose = _entry(fields, "pose", row).entries()
         position, quaternion = _entry(pose, "position", row), _entry(pose, "quaternion_wxyz", row)
-        poses.append([*_numbers(position, 3), *_numbers(quaternion, 4)])
+        poses.append([*position.numbers(3, -FAR, FAR), *quaternion.numbers(4, -FAR, FAR)])
     h = len(hand.joint_names)
     return ForeignGrasps(
         torch.tensor(joints, dtype=torch.float64).reshape(-1, h),
@@ -130,15 +130,7 @@ def _entry(fields: dict[str, Field], name: str, row: Field) -> Field:
 
 def _table(field: Field, width: int) -> np.ndarray:
     """Return a list of lists of so many numbers."""
-    return np.array([_numbers(row, width) for row in field.items(MOST_GRASPS)], dtype=float).reshape(-1, width)
-
-
-def _numbers(field: Field, count: int) -> list[float]:
-    """Return so many numbers, no more and no fewer."""
-    numbers = [x.number(-FAR, FAR) for x in field.items(count)]
-    if len(numbers) != count:
-        raise field.wrong(f"{count} numbers")
-    return numbers
+    return np.array([row.numbers(width, -FAR, FAR) for row in field.items(MOST_GRASPS)]).reshape(-1, width)
 
 
 def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion) -> ForeignGrasps:

@@ -1,24 +1,20 @@
-"""JSON files within limits, read field by field with the type of each field.
+"""JSON and TOML files within limits, read field by field with the type of each field.
 
 An error names the file and the field, such as `objects.cup.views.front`.
 """
 
 import json
-import math
-from collections.abc import Callable
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.files.write import is_file, read_bytes
+from torchgrasp.files.write import Refuse, is_file, read_bytes
 from torchgrasp.limits import JSON_BYTES, JSON_LETTERS, SHOWN_LETTERS
-
-Refuse = Callable[[str, str], BadArgument]
-"""Makes an error of what was found and what is allowed."""
 
 
 class Field(NamedTuple):
-    """A value in a JSON file with its place; `refuse` makes its error."""
+    """A value in a file with its place; `refuse` makes its error."""
 
     path: Path
     place: str
@@ -27,7 +23,10 @@ class Field(NamedTuple):
 
     def wrong(self, allowed: str) -> BadArgument:
         """Return the error of this field."""
-        text = repr(self.value)[: SHOWN_LETTERS + 1]
+        try:
+            text = repr(self.value)[: SHOWN_LETTERS + 1]
+        except ValueError:  # Python writes no whole number of more than 4300 digits
+            text = "a huge number"
         shown = text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}..."
         return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
 
@@ -50,14 +49,18 @@ class Field(NamedTuple):
             raise self.wrong(f"a text of at most {most} letters")
         return self.value
 
-    def number(self, low: float, high: float) -> float:
-        """Return a number in [low, high]."""
-        allowed = f"a number in [{low:g}, {high:g}]"
-        if isinstance(self.value, bool) or not isinstance(self.value, int | float):
-            raise self.wrong(allowed)
-        if not low <= self.value <= high or not math.isfinite(self.value):  # compares integers of any length
-            raise self.wrong(allowed)
-        return float(self.value)
+    def number(self, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> float:
+        """Return a number in [low, high]; by default any finite number."""
+        number = self.value
+        if isinstance(number, bool) or not isinstance(number, int | float) or not low <= number <= high:
+            raise self.wrong("a finite number" if high == sys.float_info.max else f"a number in [{low:g}, {high:g}]")
+        return float(number)
+
+    def numbers(self, count: int, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> list[float]:
+        """Return a list of `count` numbers in [low, high]."""
+        if not isinstance(self.value, list) or len(self.value) != count:
+            raise self.wrong(f"{count} numbers")
+        return [x.number(low, high) for x in self.items(count)]
 
     def whole(self, low: int, high: int) -> int:
         """Return a whole number in [low, high]."""

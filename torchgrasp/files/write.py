@@ -14,7 +14,10 @@ from typing import IO, Any
 
 from filelock import FileLock, Timeout
 
-from torchgrasp.errors import OutputError, Status
+from torchgrasp.errors import BadArgument, OutputError, Status
+
+Refuse = Callable[[str, str], BadArgument]
+"""Makes an error of what was found and what is allowed."""
 
 ENDING = ".part"  # ending of the name under which a file is written; a dot and the name of the file come first
 LOCK = ".lock"  # name of the lock file in a folder. It holds the process and host of the run.
@@ -75,6 +78,15 @@ def read_bytes(path: Path | str) -> bytes:
     """Return the content of a file up to the size that it reports: some files of the system never end."""
     with Path(path).open("rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
+
+
+def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> bytes:
+    """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for any other."""
+    if not is_file(path):
+        raise refuse(f"{path}, which is no file", allowed)
+    if (size := Path(path).stat().st_size) > most:
+        raise refuse(f"{path} of {size} bytes", f"{allowed} of at most {most} bytes")
+    return read_bytes(path)
 
 
 def sha256(path: Path | str) -> str:

@@ -1,18 +1,19 @@
 """Reader of hand.toml: fingers, pads, coupled and parked joints, pairs of links that can meet."""
 
 import dataclasses
+import functools
 import math
 import re
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.base import FINGERTIPS
 from torchgrasp.errors import BadArgument, HandFileError
-from torchgrasp.hand.safe_xml import read_bounded
+from torchgrasp.files import Field, read_bounded
 from torchgrasp.hand.urdf import Mimic, Triple
-from torchgrasp.limits import TOML_BYTES, XML_LETTERS
+from torchgrasp.limits import HAND_SHAPE_PAIRS, TOML_BYTES, XML_LETTERS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -85,95 +86,31 @@ class HandSpec:
         return HandFileError("hand.toml", f"{self.path}: {found}", allowed)
 
 
-def _is_number(value: Any) -> bool:
-    try:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # an integer of more than 308 digits
-        return False
-
-
-def _is_word(value: Any) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= XML_LETTERS and value.isprintable()
-
-
-def _is_texts(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(x, str) for x in value)
-
-
-class _Table:
-    """A table that knows its name, for errors, and the keys that were read."""
-
-    def __init__(self, path: Path, name: str, table: Any):
-        if not isinstance(table, dict):
-            raise HandFileError("hand.toml", f"{path}: {name.rstrip('.')} = {str(table)[:80]}", "a table")
-        self.path, self.name, self.table, self.read = path, name, table, set[str]()
-
-    def wrong(self, key: str, allowed: str) -> HandFileError:
-        value = repr(self.table[key])[:80] if key in self.table else "nothing"
-        return HandFileError("hand.toml", f"{self.path}: {self.name}{key} = {value}", allowed)
-
-    def value(self, key: str, right: Callable[[Any], bool], allowed: str) -> Any:
-        self.read.add(key)
-        if not right(self.table.get(key)):
-            raise self.wrong(key, allowed)
-        return self.table[key]
-
-    def text(self, key: str) -> str:
-        return self.value(key, _is_word, f"a text of 1 to {XML_LETTERS} characters")
-
-    def texts(self, key: str) -> tuple[str, ...]:
-        return tuple(self.value(key, _is_texts, "a list of texts"))
-
-    def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
-        allowed = f"a finite number in [{low:g}, {high:g}]"
-        return float(self.value(key, lambda x: _is_number(x) and low <= x <= high, allowed))
-
-    def triple(self, key: str) -> Triple:
-        allowed = "three finite numbers"
-        x, y, z = self.value(key, lambda v: isinstance(v, list) and len(v) == 3 and all(map(_is_number, v)), allowed)
-        return float(x), float(y), float(z)
-
-    def inner(self, key: str, optional: bool = False) -> "_Table":
-        self.read.add(key)
-        return _Table(self.path, f"{self.name}{key}.", self.table.get(key, {} if optional else None))
-
-    def tables(self, key: str) -> list["_Table"]:
-        self.read.add(key)
-        value = self.table.get(key, [])
-        if not isinstance(value, list) or len(value) > 1000:
-            raise self.wrong(key, "a list of at most 1000 tables")
-        return [_Table(self.path, f"{self.name}{key}[{i}].", v) for i, v in enumerate(value)]
-
-    def done(self) -> None:
-        """Refuse unknown keys: they are most often misspelt."""
-        unknown = sorted(set(self.table) - self.read)
-        if unknown:
-            raise self.wrong(unknown[0], f"one of {sorted(self.read)}")
-
-
 def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
     """Read and check a hand.toml; raise `HandFileError`, or `BadArgument` for fingers that it does not have."""
-    path = Path(path)
-    data = read_bounded("hand.toml", path, "a hand.toml", TOML_BYTES)
+    path, refuse = Path(path), functools.partial(HandFileError, "hand.toml")
+    data = read_bounded(path, TOML_BYTES, "a hand.toml", refuse)
     try:
         text = data.decode("utf-8")
         if _DOTTED.search(text):
-            raise HandFileError("hand.toml", f"{path}: a key of more than 16 parts", "keys of at most 16 parts")
-        top = _Table(path, "", tomllib.loads(text))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise HandFileError("hand.toml", f"{path}: {error}", "valid TOML in UTF-8") from error
-    name, base_link, approach = top.text("name"), top.text("base_link"), top.triple("approach")
-    urdf = (path.parent / top.text("urdf")).resolve()
+            raise ValueError("a key of more than 16 parts")
+        top = Field(path, "", tomllib.loads(text), refuse)
+    except (ValueError, RecursionError) as error:
+        raise refuse(f"{path}: {error}", "valid TOML in UTF-8, with keys of at most 16 parts") from error
+    names, numbers = ("name", "urdf", "base_link"), ("approach", "limit_margin", "actuators")
+    table = _entries(top, (*names, *numbers, "options"), {"finger": [], "coupling": {}, "self_collision": {}})
+    name, file, base_link = (_word(table[key]) for key in names)
+    urdf = (path.parent / file).resolve()
     if urdf.parent != path.parent.resolve():
-        raise top.wrong("urdf", "a file beside hand.toml")
-    margin, actuators = top.number("limit_margin", 0.0, 1.0), top.inner("actuators")
-    kp, kd = actuators.number("kp", 1e-6, 1e6), actuators.number("kd", 0.0, 1e6)
-    actuators.done()
-    known = tuple(_finger(t) for t in top.tables("finger"))
+        raise table["urdf"].wrong("a file beside hand.toml")
+    approach, margin = _triple(table["approach"]), table["limit_margin"].number(0.0, 1.0)
+    actuators = _entries(table["actuators"], ("kp", "kd"), {})
+    kp, kd = actuators["kp"].number(1e-6, 1e6), actuators["kd"].number(0.0, 1e6)
+    known = tuple(map(_finger, table["finger"].items()))
     if len({f.name for f in known}) < len(known):
-        raise HandFileError("hand.toml", f"{path}: fingers {[f.name for f in known]}", "different names")
-    options, coupling, pairs = _options(top, known), _coupling(top), _pairs(top)
-    top.done()
+        raise refuse(f"{path}: fingers {[f.name for f in known]}", "different names")
+    options = {name: _option(field, known) for name, field in table["options"].entries().items()}
+    coupling, pairs = _coupling(table["coupling"]), _pairs(table["self_collision"])
     option, (chosen, parked) = _choose(options, {f.name: f for f in known}, coupling, fingers)
     return HandSpec(
         path, name, urdf, base_link, approach, margin, kp, kd, option, chosen, options, known, parked, coupling, pairs,
@@ -181,36 +118,58 @@ def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
     )  # fmt: skip
 
 
-def _finger(table: _Table) -> Finger:
-    kind = table.text("tip")
+def _entries(table: Field, required: Sequence[str], optional: Mapping[str, Any]) -> dict[str, Field]:
+    """Return the fields of a table, with defaults for the optional; refuse unknown keys, which are often misspelt."""
+    fields = table.entries()
+    for key in sorted(fields.keys() - {*required, *optional}):
+        raise fields[key].wrong(f"one of {sorted([*required, *optional])}")
+    place = f"{table.place}." if table.place else ""
+    missing = {key: table._replace(place=place + key, value=optional.get(key)) for key in (*required, *optional)}
+    return missing | fields
+
+
+def _word(field: Field) -> str:
+    """Return a name, which is not empty and can be printed."""
+    if not (text := field.text(XML_LETTERS)) or not text.isprintable():
+        raise field.wrong(f"a text of 1 to {XML_LETTERS} characters")
+    return text
+
+
+def _texts(field: Field) -> tuple[str, ...]:
+    return tuple(x.text() for x in field.items())
+
+
+def _triple(field: Field) -> Triple:
+    x, y, z = field.numbers(3)
+    return x, y, z
+
+
+def _finger(field: Field) -> Finger:
+    """Read a finger with its pad."""
+    required = ("name", "joints", "tip_link", "contact", "normal", "tip")
+    table = _entries(field, required, {"center": None, "radius": None})
+    contact, normal, kind = _triple(table["contact"]), _triple(table["normal"]), table["tip"].value
     if kind not in ("sphere", "point"):
-        raise table.wrong("tip", "'sphere' or 'point'")
-    contact, normal = table.triple("contact"), table.triple("normal")
-    if abs(math.dist(normal, (0, 0, 0)) - 1) > 1e-6:
-        raise table.wrong("normal", "a unit vector")
+        raise table["tip"].wrong("'sphere' or 'point'")
+    if abs(math.hypot(*normal) - 1) > 1e-6:
+        raise table["normal"].wrong("a unit vector")
     center, radius = contact, 0.0
     if kind == "sphere":
-        center, radius = table.triple("center"), table.number("radius", 1e-4, 0.1)
+        center, radius = _triple(table["center"]), table["radius"].number(1e-4, 0.1)
         if math.dist(contact, tuple(c + radius * n for c, n in zip(center, normal, strict=True))) > 1e-6:
-            raise table.wrong("contact", "center + radius * normal")
+            raise table["contact"].wrong("center + radius * normal")
     pad = Pad(contact, normal, center, radius)
-    finger = Finger(table.text("name"), table.texts("joints"), table.text("tip_link"), pad)
-    table.done()
-    return finger
+    return Finger(_word(table["name"]), _texts(table["joints"]), _word(table["tip_link"]), pad)
 
 
-def _options(top: _Table, known: tuple[Finger, ...]) -> dict[str, Option]:
-    """Read the grasping fingers and the parked joints of every option."""
-    table, by_name, options = top.inner("options"), {f.name: f for f in known}, dict[str, Option]()
-    for name in table.table:
-        option = table.inner(name)
-        names = option.texts("fingers")
-        if not _is_graspable(names, by_name):
-            raise option.wrong("fingers", f"{SUPPORTED} of {sorted(by_name)}")
-        park = option.inner("parked", optional=True)
-        options[name] = Option(tuple(by_name[x] for x in names), {joint: park.number(joint) for joint in park.table})
-        option.done()
-    return options
+def _option(field: Field, known: tuple[Finger, ...]) -> Option:
+    """Read the grasping fingers and the parked joints of an option."""
+    table, by_name = _entries(field, ("fingers",), {"parked": {}}), {f.name: f for f in known}
+    names = _texts(table["fingers"])
+    if not _is_graspable(names, by_name):
+        raise table["fingers"].wrong(f"{SUPPORTED} of {sorted(by_name)}")
+    parked = {joint: position.number() for joint, position in table["parked"].entries().items()}
+    return Option(tuple(by_name[x] for x in names), parked)
 
 
 def _is_graspable(names: tuple[str, ...], known: Collection[str]) -> bool:
@@ -241,27 +200,25 @@ def _choose(
     return ",".join(names), Option(fingers, {joint: value for joint, value in parked.items() if joint not in moving})
 
 
-def _coupling(top: _Table) -> dict[str, Mimic]:
+def _coupling(field: Field) -> dict[str, Mimic]:
     """Read the coupled joints."""
-    table, coupling = top.inner("coupling", optional=True), dict[str, Mimic]()
-    for joint in table.table:
-        row = table.inner(joint)
-        coupling[joint] = Mimic(row.text("source"), row.number("ratio"), row.number("offset"))
-        row.done()
+    coupling, joints = dict[str, Mimic](), field.entries()
+    for joint, row in joints.items():
+        table = _entries(row, ("source", "ratio", "offset"), {})
+        coupling[joint] = Mimic(_word(table["source"]), table["ratio"].number(), table["offset"].number())
     for joint, mimic in coupling.items():
         if mimic.source in coupling:
-            raise table.wrong(joint, "a source that is not coupled itself")
+            raise joints[joint].wrong("a source that is not coupled itself")
     return coupling
 
 
-def _pairs(top: _Table) -> tuple[tuple[str, str], ...] | None:
-    """Read the pairs of links to test for self-collision."""
-    table, pairs = top.inner("self_collision", optional=True), None
-    if "pairs" in table.table:
-
-        def right(rows: Any) -> bool:
-            return isinstance(rows, list) and all(_is_texts(r) and len(r) == 2 and r[0] != r[1] for r in rows)
-
-        pairs = tuple((a, b) for a, b in table.value("pairs", right, "a list of pairs of different links"))
-    table.done()
-    return pairs
+def _pairs(field: Field) -> tuple[tuple[str, str], ...] | None:
+    """Read the pairs of links to test for self-collision; None if there is no list of them."""
+    pairs = _entries(field, (), {"pairs": None})["pairs"]
+    if pairs.value is None:
+        return None
+    found = tuple((row, _texts(row)) for row in pairs.items(HAND_SHAPE_PAIRS))
+    for row, names in found:
+        if len(names) != 2 or names[0] == names[1]:
+            raise row.wrong("a pair of different links")
+    return tuple((one, two) for _, (one, two) in found)

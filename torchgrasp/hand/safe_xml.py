@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from torchgrasp.errors import HandFileError
-from torchgrasp.files import is_file, read_bytes
 from torchgrasp.limits import XML_DEPTH, XML_ELEMENTS, XML_LETTERS
 
 IGNORED = {"material", "transmission", "gazebo", "ros2_control", "mujoco", "sensor"}
@@ -47,15 +46,6 @@ NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
     "mimic": {"multiplier": (1, "1"), "offset": (1, "0")},
 }
 """Attributes that are numbers: their count and default. None: required; "": omitted."""
-
-
-def read_bounded(source: str, path: Path, wanted: str, most: int) -> bytes:
-    """Read a file of at most `most` bytes; `source` and `wanted` describe the file in errors."""
-    if not is_file(path):
-        raise HandFileError(source, f"{path}, which is no file", wanted)
-    if path.stat().st_size > most:
-        raise HandFileError(source, f"{path} of {path.stat().st_size} bytes", f"{wanted} of at most {most} bytes")
-    return read_bytes(path)
 
 
 class _BoundedBuilder(ET.TreeBuilder):

@@ -12,8 +12,9 @@ import torch
 
 from torchgrasp.checks import checked
 from torchgrasp.errors import HandFileError
+from torchgrasp.files import read_bounded
 from torchgrasp.geometry.frames import rotation_from_rpy
-from torchgrasp.hand.safe_xml import parse_urdf, read_bounded
+from torchgrasp.hand.safe_xml import parse_urdf
 from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
 SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
@@ -142,7 +143,7 @@ def read_published(path: Path | str) -> Urdf:
         HandFileError: the file is missing, too large, hostile or no tree of bodies.
     """
     path = Path(path)
-    data = read_bounded("urdf", path, "a URDF file", URDF_BYTES)
+    data = read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf"))
     robot = parse_urdf(path, data)  # links and joints alone, each with all of its names and with finite numbers
     links, joints = tuple(map(_link, robot.findall("link"))), tuple(map(_joint, robot.findall("joint")))
     urdf = Urdf(path, robot.attrib["name"], "", links, joints, data, ET.tostring(robot))

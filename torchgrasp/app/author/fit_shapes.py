@@ -4,6 +4,7 @@ A mesh is sampled. Its points get a bounding box, and a box is cut in two where 
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -13,9 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from torchgrasp.app.author.repair import place, pose_of
+from torchgrasp.errors import HandFileError
+from torchgrasp.files import read_bounded
 from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.hand.hand_toml import Pad
-from torchgrasp.hand.safe_xml import read_bounded
 from torchgrasp.hand.urdf import Shape, Urdf
 from torchgrasp.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACES
 
@@ -118,7 +120,7 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     import trimesh
 
     path = mesh_file(urdf, name, folder)
-    data = read_bounded("urdf", path, "a mesh", MESH_BYTES)
+    data = read_bounded(path, MESH_BYTES, "a mesh", functools.partial(HandFileError, "urdf"))
     allowed = f"a triangle mesh of at most {MESH_FACES} faces"
     try:
         mesh = load_triangles(data, path.suffix.lower(), process=False)
