@@ -99,8 +99,7 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
             coupling[row, names.index(source)] = ratio
             offset[row] = shift
         elif source in spec.parked or spec.option not in spec.options:
-            opened = min(max(0.0, movable[source].lower), movable[source].upper)
-            offset[row] = ratio * spec.parked.get(source, opened) + shift
+            offset[row] = ratio * spec.parked.get(source, movable[source].rest) + shift
         else:
             raise spec.wrong(f"joint {joint}, which does neither", "every joint to grasp or to be parked")
     return ActuatedJoints(names, limits[:, 0].clone(), limits[:, 1].clone(), coupling, offset)

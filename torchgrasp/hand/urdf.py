@@ -75,6 +75,11 @@ class Joint:
     velocity: float = 0.0
     mimic: Mimic | None = None
 
+    @property
+    def rest(self) -> float:
+        """The position of a parked joint: zero, or the limit next to zero."""
+        return min(max(0.0, self.lower), self.upper)
+
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:

@@ -155,15 +155,13 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _coupling(urdf: Urdf) -> dict[str, Mimic]:
+    """Return the coupled joints by name."""
     return {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
 
 
 def _gains(urdf: Urdf) -> tuple[float, float]:
-    """Return stiffness [N m/rad] and damping [N m s/rad] of the drives, similar to those of the shipped hands.
-
-    The stiffness follows from the effort of the weakest joint. The damping is at least critical, where simulations add
-    a rotor's inertia of 1e-3 kg m2 to each joint.
-    """
+    """Return stiffness [N m/rad] and damping [N m s/rad] of the drives, similar to those of the shipped hands."""
+    rotor = 1e-3  # inertia [kg m2] that simulations add to each joint; the damping is at least critical with it
     free = [j for j in urdf.movable if j.mimic is None]
     kp = min(4.0 * min(j.effort for j in free), 10.0)
     poses = tree_from_urdf(urdf).poses(torch.zeros(1, len(urdf.movable), dtype=torch.float64))[0].numpy()
@@ -177,17 +175,14 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
         moved = [k for k, name in enumerate(names) if j in urdf.joints_above(name)]
         arms = np.cross(pose[:3, :3] @ j.axis, centres[moved] - pose[:3, 3])
         heaviest = max(heaviest, float(np.array([urdf.links[k].mass for k in moved]) @ (arms**2).sum(1)))
-    return kp, max(0.03 * kp, 2 * np.sqrt(kp * (heaviest + 1e-3)))
+    return kp, max(0.03 * kp, 2 * np.sqrt(kp * (heaviest + rotor)))
 
 
 def _toml_text(
     urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]], approach: Triple, names: tuple[str, str], seed: int
 ) -> str:
     """Write a hand.toml, with pads by links, links by options, and the names of the hand and of its URDF file."""
-    coupling = _coupling(urdf)
-    chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
-    kp, kd = _gains(urdf)
-    called = {tip: tip.removesuffix("_tip") for tip in pads}
+    coupling, (kp, kd) = _coupling(urdf), _gains(urdf)
     lines = [
         "# A draft. Lengths [m], angles [rad], in the link frames of the URDF. Look over what is marked CHECK.",
         f"name = {_toml(names[0])}",
@@ -204,7 +199,17 @@ def _toml_text(
         lines += ["", "# joint = ratio * source + offset", "[coupling]"]
     for joint, (source, ratio, offset) in coupling.items():
         lines.append(f"{_toml(joint)} = {{ source = {_toml(source)}, ratio = {ratio!r}, offset = {offset!r} }}")
-    lines += ["", "# Which fingers grasp, in grasp order; every other joint is parked."]
+    lines += ["", *_finger_lines(urdf, pads, sets)]
+    lines += ["[self_collision]", "# The pairs of links that meet in some random postures, but not in nearly all."]
+    lines += ["pairs = [", *(f"  {_toml(pair)}," for pair in collision_pairs(urdf, coupling, seed=seed)), "]", ""]
+    return "\n".join(lines)
+
+
+def _finger_lines(urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]]) -> list[str]:
+    """Return the lines of a hand.toml on its options and fingers."""
+    chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
+    called = {tip: tip.removesuffix("_tip") for tip in pads}
+    lines = ["# Which fingers grasp, in grasp order; every other joint is parked."]
     for option, tips in sets.items():
         guessed = "  # CHECK" if len(tips) < len(pads) else ""
         lines += [f"[options.{option}]", f"fingers = {_toml([called[tip] for tip in tips])}{guessed}"]
@@ -219,17 +224,14 @@ def _toml_text(
         lines += [f"contact = {_toml(pad.contact)}  # CHECK: the middle of the pad", f"normal = {_toml(pad.normal)}"]
         sphere = ['tip = "sphere"', f"center = {_toml(pad.center)}", f"radius = {pad.radius!r}"]
         lines += [*(sphere if pad.radius else ['tip = "point"']), ""]
-    lines += ["[self_collision]", "# The pairs of links that meet in some random postures, but not in nearly all."]
-    lines += ["pairs = [", *(f"  {_toml(pair)}," for pair in collision_pairs(urdf, coupling, seed=seed)), "]", ""]
-    return "\n".join(lines)
+    return lines
 
 
 def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
     """Return the positions of joints that neither grasp nor lead nor follow: zero, or the limit next to zero."""
     coupling = _coupling(urdf)
     moved = grasping | {coupling[j].source for j in grasping if j in coupling}
-    free = (j for j in urdf.movable if j.name not in coupling and j.name not in moved)
-    return {j.name: min(max(0.0, j.lower), j.upper) for j in free}
+    return {j.name: j.rest for j in urdf.movable if j.name not in coupling and j.name not in moved}
 
 
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:

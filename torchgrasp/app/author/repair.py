@@ -110,7 +110,7 @@ def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
         return urdf, [f"{len(common)} joints above {urdf.root} move all fingertips, an arm: {done[0]}"]
     if not common:
         return urdf, []
-    at = {j.name: min(max(0.0, j.lower), j.upper) for j in common}
+    at = {j.name: j.rest for j in common}
     for j in urdf.movable:
         if j.mimic and j.mimic.source in at:
             at[j.name] = j.mimic.ratio * at[j.mimic.source] + j.mimic.offset
@@ -131,48 +131,65 @@ def _fixed(joint: Joint, value: float) -> Joint:
 
 def repair_joints(urdf: Urdf) -> Step:
     """Add missing limits and drives; let coupled joints follow an independent joint, within the limits of both."""
-    done, joints, idle = [], {j.name: j for j in urdf.joints}, list[str]()
-    for name, j in joints.items():
-        if j.kind == "fixed":
-            continue
-        if math.isinf(j.upper - j.lower):
-            if j.kind == "prismatic":
-                raise urdf.wrong(f"joint {name} without a limit", "lower and upper limits of a sliding joint")
-            j = dataclasses.replace(j, kind="revolute", lower=-math.pi, upper=math.pi)
-            done.append(f"joint {name} has no limits: they are set to half a turn either way")
-        drive = (j.effort if j.effort > 0 else EFFORT, j.velocity if j.velocity > 0 else VELOCITY)
-        if drive != (j.effort, j.velocity):
-            idle.append(name)
-            j = dataclasses.replace(j, effort=drive[0], velocity=drive[1])
-        joints[name] = j
-    if idle:
-        done.append(f"{', '.join(idle)} without effort or velocity get {EFFORT:g} N m, {VELOCITY:g} rad/s")
+    joints = {j.name: j for j in urdf.joints}
+    done = _add_limits(urdf, joints) + _add_drives(joints) + _follow_directly(joints) + _limit_leaders(urdf, joints)
+    return dataclasses.replace(urdf, joints=tuple(joints.values())), done
+
+
+def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
+    """Limit endless turning joints to half a turn either way; refuse endless sliding joints."""
+    endless = [j for j in urdf.movable if math.isinf(j.upper - j.lower)]
+    for j in endless:
+        if j.kind == "prismatic":
+            raise urdf.wrong(f"joint {j.name} without a limit", "lower and upper limits of a sliding joint")
+        joints[j.name] = dataclasses.replace(j, kind="revolute", lower=-math.pi, upper=math.pi)
+    return [f"joint {j.name} has no limits: they are set to half a turn either way" for j in endless]
+
+
+def _add_drives(joints: dict[str, Joint]) -> list[str]:
+    """Give joints without effort or velocity those of small hands."""
+    idle = [j for j in joints.values() if j.kind != "fixed" and not (j.effort > 0 and j.velocity > 0)]
+    for j in idle:
+        effort, velocity = (x if x > 0 else usual for x, usual in ((j.effort, EFFORT), (j.velocity, VELOCITY)))
+        joints[j.name] = dataclasses.replace(j, effort=effort, velocity=velocity)
+    names = ", ".join(j.name for j in idle)
+    return [f"{names} without effort or velocity get {EFFORT:g} N m, {VELOCITY:g} rad/s"] if idle else []
+
+
+def _follow_directly(joints: dict[str, Joint]) -> list[str]:
+    """Let followers of followers follow the first joint of their chain."""
+    done = []
     for name, j in joints.items():
         mimic = j.mimic
         while mimic and (above := joints[mimic.source].mimic):
             mimic = Mimic(above.source, mimic.ratio * above.ratio, mimic.ratio * above.offset + mimic.offset)
-        if mimic != j.mimic:
-            leader = mimic and mimic.source
-            done.append(f"joint {name} follows a follower of {leader}: it follows {leader} directly")
+        if mimic and mimic != j.mimic:
+            done.append(f"joint {name} follows a follower of {mimic.source}: it follows {mimic.source} directly")
             joints[name] = dataclasses.replace(j, mimic=mimic)
+    return done
+
+
+def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
+    """Limit each leader to the positions at which its followers are within their limits."""
+    done = []
     for name, j in joints.items():
-        if j.mimic and not j.mimic.ratio:
+        if (mimic := j.mimic) is None:
+            continue
+        if not mimic.ratio:
             raise urdf.wrong(f"joint {name} that follows with a ratio of 0", "a fixed joint, or another ratio")
-        if j.mimic:
-            source = joints[j.mimic.source]
-            ends = sorted((end - j.mimic.offset) / j.mimic.ratio for end in (j.lower, j.upper))
-            low, high = max(source.lower, ends[0]), min(source.upper, ends[1])
-            if not low < high:
-                raise urdf.wrong(
-                    f"joint {name} that follows {source.name} outside its own limits", "limits that overlap"
-                )
-            if (low, high) != (source.lower, source.upper):
-                joints[source.name] = dataclasses.replace(source, lower=low, upper=high)
-                done.append(
-                    f"joint {source.name} is limited to [{low:.6g}, {high:.6g}] instead of [{source.lower:.6g}, "
-                    f"{source.upper:.6g}]: {name}, which follows it, would leave its own limits"
-                )
-    return dataclasses.replace(urdf, joints=tuple(joints.values())), done
+        leader = joints[mimic.source]
+        ends = sorted((end - mimic.offset) / mimic.ratio for end in (j.lower, j.upper))
+        low, high = max(leader.lower, ends[0]), min(leader.upper, ends[1])
+        if not low < high:
+            found = f"joint {name} that follows {leader.name} outside its own limits"
+            raise urdf.wrong(found, "limits that overlap")
+        if (low, high) != (leader.lower, leader.upper):
+            joints[leader.name] = dataclasses.replace(leader, lower=low, upper=high)
+            done.append(
+                f"joint {leader.name} is limited to [{low:.6g}, {high:.6g}] instead of [{leader.lower:.6g}, "
+                f"{leader.upper:.6g}]: {name}, which follows it, would leave its own limits"
+            )
+    return done
 
 
 def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
