@@ -57,7 +57,7 @@ COMMANDS = (
     "cloud check {data}/jug/view.ply",
     "cloud thin {data}/jug/view.ply --voxel 0.005 --out {out}/thin.ply",
     "grasp {data}/scene.npz --hand barrett --out {out}/scene --starts 60 --no-report",
-    "hand check barrett",
+    "hand check barrett --out {out}/hand.png",
     "grasp {data}/jug/view.ply --hand barrett --out {out}/jug --starts 60 --no-report",
     "shape surface {data}/jug/view.ply --out {out}/jug.ply",
 )
@@ -154,6 +154,7 @@ def run_command(words: str) -> str:
     """Return the hash of what a command prints, without paths and times, and its exit code."""
     from torchgrasp.app.cli import main
     from torchgrasp.data.shipped import DATA
+    from torchgrasp.hand import hands_folder
 
     stdout = io.StringIO()
     with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(stdout):
@@ -162,7 +163,9 @@ def run_command(words: str) -> str:
             code = main(words.format(data=DATA, out=out).split())
         except SystemExit as end:
             code = end.code
-        text = stdout.getvalue().replace(str(DATA), "DATA").replace(out, "OUT")
+        text = stdout.getvalue()
+    for folder, name in ((DATA, "DATA"), (hands_folder(), "HANDS"), (out, "OUT")):
+        text = text.replace(str(folder), name)
     return digest(re.sub(r"[0-9.]+ (s|min)\b", "TIME", text), str(code))
 
 
