@@ -1,4 +1,4 @@
-"""Grasps that come in waves: what is yielded stays, and all together are those of one call."""
+"""Grasps that come in batches: what is yielded stays, and all together are those of one call."""
 
 import dataclasses
 from itertools import pairwise
@@ -33,7 +33,7 @@ def whole():
 
 @pytest.fixture(scope="module")
 def parts():
-    """The same wave by wave."""
+    """The same batch by batch."""
     return list(stream_grasps(VIEW, HAND, SPEC, 80))
 
 
@@ -47,7 +47,7 @@ def test_the_union_of_the_stream_is_the_batch_call(whole, parts):
     assert parts[-1].meta == grasps.meta
 
 
-def test_each_wave_holds_executable_grasps_best_first(parts):
+def test_each_batch_holds_executable_grasps_best_first(parts):
     for part in parts:
         assert len(part) and bool((part.status == Status.OK).all()) and bool(part.certificate.closed.all())
         assert bool((part.score.diff() <= 0).all())
@@ -55,13 +55,13 @@ def test_each_wave_holds_executable_grasps_best_first(parts):
     assert len(points.unique(dim=0)) == len(points)  # no triple twice
 
 
-def test_a_budget_ends_after_the_wave_that_passes_it(parts):
+def test_a_budget_ends_after_the_batch_that_passes_it(parts):
     heard = []
     short = plan_grasps(VIEW, HAND, SPEC, 80, time_budget=1e-3, observer=lambda *stage: heard.append(stage))
     assert same(short[short.status == Status.OK], parts[0])
     assert short.meta["starts"] == "32"
     stages = {stage: value for stage, _, value in heard}
-    assert list(stages) == ["shape", "wave", "plan", "certify", "query", "refine"] and len(heard) == 6
+    assert list(stages) == ["shape", "batch", "plan", "certify", "query", "refine"] and len(heard) == 6
     assert len(stages["plan"]) == 32  # what was not planned has no status
     assert len(short) <= FIRST
     assert same(plan_grasps(VIEW, HAND, SPEC, 20, time_budget=1e6), plan_grasps(VIEW, HAND, SPEC, 20))
@@ -70,16 +70,16 @@ def test_a_budget_ends_after_the_wave_that_passes_it(parts):
             plan_grasps(VIEW, HAND, SPEC, 20, time_budget=wrong)
 
 
-def test_an_observer_hears_of_each_wave_and_of_the_stages_of_all(whole):
+def test_an_observer_hears_of_each_batch_and_of_the_stages_of_all(whole):
     grasps, heard = whole
     stages = [stage for stage, _, _ in heard]
-    assert stages == ["shape", "wave", "plan", "certify", "query", "refine"]
+    assert stages == ["shape", "batch", "plan", "certify", "query", "refine"]
     values = {stage: value for stage, _, value in heard}
     assert len(values["plan"]) == 80 and bool(values["certify"].closed.all())
-    assert int(values["query"].row.max()) == len(values["certify"]) - 1  # rows of all waves
+    assert int(values["query"].row.max()) == len(values["certify"]) - 1  # rows of all batches
     assert same(values["refine"], grasps)
-    waves = [value for stage, _, value in heard if stage == "wave"]
-    assert sum(len(wave) for wave in waves) < len(grasps) and len(waves[0]) <= FIRST
+    batches = [value for stage, _, value in heard if stage == "batch"]
+    assert sum(len(batch) for batch in batches) < len(grasps) and len(batches[0]) <= FIRST
 
 
 def test_who_stops_listening_stops_the_work():
@@ -88,10 +88,10 @@ def test_who_stops_listening_stops_the_work():
     assert heard == []  # nothing is done before the first grasps are asked for
     next(stream)
     stream.close()
-    assert heard == ["shape", "wave"]
+    assert heard == ["shape", "batch"]
 
 
-def test_wrong_arguments_are_refused_before_the_first_wave():
+def test_wrong_arguments_are_refused_before_the_first_batch():
     for options, word in (({"starts": 0}, "starts"), ({"mode": "best"}, "mode"), ({"ranking": "best"}, "ranking")):
         with pytest.raises((BadArgument, TypeError), match=word):
             stream_grasps(VIEW, HAND, SPEC, **options)
@@ -99,15 +99,15 @@ def test_wrong_arguments_are_refused_before_the_first_wave():
         stream_grasps(VIEW, HAND, SPEC, colour="red")
 
 
-def test_waves_plan_all_starts_and_try_all_rows():
+def test_batches_plan_all_starts_and_try_all_rows():
     for starts in [*range(1, 300), 1000, 10_000]:
         for most in (160, 250):
-            waves = schedule(starts, most)
-            assert sum(wave.starts for wave in waves) == starts
-            assert sum(wave.tried for wave in waves) == min(starts, most)
-            assert min(wave.tried for wave in waves) >= min(FIRST, starts)
-            assert all(b.tried >= a.tried for a, b in pairwise(waves))
-            assert waves[0].starts >= waves[0].tried and min(wave.starts for wave in waves) >= 0
+            batches = schedule(starts, most)
+            assert sum(batch.starts for batch in batches) == starts
+            assert sum(batch.tried for batch in batches) == min(starts, most)
+            assert min(batch.tried for batch in batches) >= min(FIRST, starts)
+            assert all(b.tried >= a.tried for a, b in pairwise(batches))
+            assert batches[0].starts >= batches[0].tried and min(batch.starts for batch in batches) >= 0
 
 
 def offer(points, seeds_of):

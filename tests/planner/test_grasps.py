@@ -185,8 +185,8 @@ def test_the_file_names_everything(run, tmp_path):
 
 
 def test_stages_come_in_the_order_of_the_flow(run):
-    waves = ["wave"] if run[1].meta["mode"] == "joint" else []
-    assert list(run[2]) == ["shape", *waves, "plan", "certify", "query", "refine"]
+    batches = ["batch"] if run[1].meta["mode"] == "joint" else []
+    assert list(run[2]) == ["shape", *batches, "plan", "certify", "query", "refine"]
 
 
 def test_bad_arguments_are_refused_before_any_work():

@@ -1,4 +1,4 @@
-"""Where to touch: contacts on an uncertain surface, with certificates of closure."""
+"""The contact planner: contact points on an uncertain surface, with certificates of force closure."""
 
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure_probability import ClosureProbability, closure_probability

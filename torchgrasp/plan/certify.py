@@ -1,8 +1,8 @@
-"""Certificates of frictional form closure, Eq. (13): a verdict for every row of contacts, with its proof.
+"""Certificates of frictional form closure, Eq. (13): for each contact set a verdict, with a proof.
 
-The proof of closure is a balance phi. The proof against it is a witness: a wrench that no contact opposes. Either is
-checked, whoever found it: phi bounds the margin from below, the witness from above. A batched simplex (`closure`)
-finds both. HiGHS decides where their bounds leave the verdict open.
+Coefficients phi that balance all wrenches prove closure, and bound the margin from below. A witness, a direction that
+no contact wrench opposes, disproves closure, and bounds the margin from above. A batched simplex method (`closure`)
+finds both. HiGHS decides where the two bounds leave the verdict open.
 """
 
 import numpy as np
@@ -30,17 +30,17 @@ UNIT_TOLERANCE = 1e-3  # largest difference of a given normal's length from 1: w
 @checked
 @single_threaded
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
-    """Prove in float64 that the contacts of a row have frictional form closure, Eq. (13), or that they have not.
+    """Prove in float64 whether contact sets have frictional form closure, Eq. (13).
 
-    The margin is max s: W phi = 0, sum phi = 1, phi >= s. The cones have `spec.edges` edges at `spec.planned_friction`.
-    The margin is -inf where no phi balances. Closed rows have a margin of at least 1e-6 and full rank.
+    The margin is max s: W phi = 0, sum phi = 1, phi >= s; -inf if no phi balances. The friction cones have `spec.edges`
+    edges at friction `spec.planned_friction`. A closed set has a margin of at least 1e-6 and wrenches of full rank.
 
-    The witness v of an open row separates: v.w >= 0 for every edge wrench w, to rounding. With a margin between 0 and
-    1e-6, v.w >= -margin. Where only rank is lacking, the wrenches are least along v. Rows that are not finite are open
-    and hold NaN.
+    The witness v of a set that is not closed satisfies v.w >= 0 for every edge wrench w, up to rounding; for a margin
+    between 0 and 1e-6 v.w >= -margin. If only the rank is too low, the wrenches are smallest along v. Contacts that are
+    not finite are not closed and give NaN.
 
     Args:
-        contacts: three to five a row, of any planner, with outward unit normals; other fields are not read.
+        contacts: sets of three to five contacts with outward unit normals, from any planner.
         spec: friction and edges; `ContactSpec()` by default.
 
     Raises:
@@ -74,7 +74,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 def _prove(
     wrench: Float[Tensor, "b m 6"],
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
-    """Return margin, residual and witness, by HiGHS where the batch proves nothing."""
+    """Return margin, residual and witness of each wrench matrix; HiGHS decides what the simplex method leaves open."""
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
     margin, upper = phi.amin(-1), bound_margin(wrench, witness)
@@ -88,7 +88,7 @@ def _prove(
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
-    """Return the upper bound of the margin that a wrench w proves; NaN for a useless w.
+    """Return the upper bound of the margin that a witness proves; NaN for a witness that proves nothing.
 
     With g_k = w.w_k, phi = s + psi and psi >= 0: 0 = sum phi g >= s sum g + (1 - m s) min g.
     Hence s <= -min g / sum(g - min g).
@@ -99,9 +99,9 @@ def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) 
 
 
 def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]:
-    """Return the margin s of one wrench matrix (m, 6), the largest |W phi|, and a witness.
+    """Return margin, residual max |W phi| and witness for one matrix of m wrenches, by HiGHS.
 
-    The programme has seven equations in s and psi = phi - s >= 0.
+    The linear programme has seven equations in the margin s and psi = phi - s >= 0.
     """
     from scipy.optimize import linprog
 
@@ -126,7 +126,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
 
 
 def check_unit(normals: Vectors) -> Vectors:
-    """Return the contacts' normals; raise `BadArgument` for a length other than 1. NaN passes."""
+    """Return the normals; raise `BadArgument` if their length is not 1. NaN passes."""
     length = torch.linalg.vector_norm(normals, dim=-1)
     wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
     if len(wrong):
@@ -137,7 +137,7 @@ def check_unit(normals: Vectors) -> Vectors:
 
 
 def check_contacts(contacts: Contacts) -> Contacts:
-    """Return contacts of good shapes; raise `BadArgument` for others, and for a number of contacts beyond 3 to 5."""
+    """Return the contacts; raise `BadArgument` for wrong shapes, or for other than 3 to 5 contacts in a set."""
     points = contacts.points
     for name, value in (("points", points), ("normals", contacts.normals)):
         if value.shape != (*points.shape[:2], 3) or not value.is_floating_point():
@@ -150,6 +150,6 @@ def check_contacts(contacts: Contacts) -> Contacts:
 
 
 def _checked(contacts: Contacts) -> tuple[Vectors, Vectors]:
-    """Return checked points and normals in float64 on the CPU."""
+    """Return checked contact points and normals in float64 on the CPU."""
     points = check_contacts(contacts).points
     return points.detach().double().cpu(), check_unit(contacts.normals.detach().double().cpu())

@@ -44,19 +44,19 @@ eight programmes it is 4e-5."""
 
 
 def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
-    """Return the contacts' centre and root-mean-square radius; 1 for a radius of 0."""
+    """Return the centroid and root-mean-square radius of each contact set; the radius is 1 if it would be 0."""
     centre = points.mean(-2, keepdim=True)
     radius = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True) / math.sqrt(points.shape[-2])
     return centre, torch.where(radius == 0, 1.0, radius)
 
 
 def tangents(points: Vectors, normals: Vectors) -> Vectors:
-    """Return a unit tangent at each contact, which turns with the object.
+    """Return a unit tangent at each contact that rotates with the object: the first edge of its friction cone.
 
-    It lies in the plane of three contacts. Of more, those three are taken whose plane leans most against the normal, by
-    its area. Where all contacts lie in one plane and a normal is perpendicular to it, the tangent of three is
-    arbitrary: no friction closes there, because balanced forces are coplanar. That of more points to the farthest
-    contact. For contacts on a line it is arbitrary, too.
+    It lies in the plane of three contacts. For four or five contacts, the three are chosen whose plane is the most
+    perpendicular to the contact's tangent plane, weighted by area. The tangent is arbitrary for contacts on a line, and
+    for three contacts with a normal perpendicular to their plane, where friction cannot give closure. In that case a
+    tangent of four or five contacts points to the farthest contact.
     """
     first, second, third = subsets(points.shape[1], 3, points.device).unbind(1)
     plane = torch.linalg.cross(points[:, second] - points[:, first], points[:, third] - points[:, first])  # (b, k, 3)
@@ -77,14 +77,14 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
 
 
 def _take(vectors: Float[Tensor, "b f k 3"], index: Int[Tensor, "b f 1"]) -> Vectors:
-    """Return one of k vectors at each contact."""
+    """Return one of k vectors at each contact, given its index."""
     return vectors.gather(2, index[..., None].expand(-1, -1, 1, 3))[:, :, 0]
 
 
 def cone_edges(
     normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: float, edges: int
 ) -> Float[Tensor, "*b e 3"]:
-    """Return the edges of the linearised cones: forces of normal component 1, the first leaning along `tangent`."""
+    """Return the edges of linearised friction cones: forces of normal component 1; the first leans along `tangent`."""
     angle = torch.arange(edges, dtype=normals.dtype, device=normals.device) * (2 * math.pi / edges)
     other = torch.linalg.cross(normals, tangent)
     lean = angle.cos()[:, None] * tangent[..., None, :] + angle.sin()[:, None] * other[..., None, :]
@@ -92,7 +92,7 @@ def cone_edges(
 
 
 def wrenches(points: Vectors, normals: Vectors, friction: float, edges: int = 8) -> Float[Tensor, "b f e 6"]:
-    """Return the primitive contact wrenches w of Eq. (13): force, then torque."""
+    """Return the primitive contact wrenches w of Eq. (13), force then torque, of the edges of all friction cones."""
     force = cone_edges(normals, tangents(points, normals), friction, edges)
     centre, radius = centre_and_radius(points)
     arm = ((points - centre) / radius)[:, :, None].expand_as(force)
@@ -100,16 +100,16 @@ def wrenches(points: Vectors, normals: Vectors, friction: float, edges: int = 8)
 
 
 def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
-    """Return the smallest over the largest singular value of each wrench matrix."""
+    """Return the ratio of the smallest to the largest singular value of each grasp's wrench matrix."""
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
 
 
 def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
-    """Return the balance phi of the greatest margin of each grasp, and the unit witness of the margin.
+    """Return the coefficients phi of the greatest margin of each grasp, and the unit witness of that margin.
 
-    Rounding, degenerate wrenches or too few pivots may spoil either, so `certify` checks them. Where nothing balances,
-    the witness opposes all wrenches alike, and phi is meaningless.
+    Rounding, degenerate wrenches or too few pivots may spoil both, so `certify` checks them. If no coefficients
+    balance, the witness has positive products with all wrenches, and phi is meaningless.
 
     Args:
         wrench: the primitive wrenches, float64.
@@ -120,7 +120,7 @@ def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m
 
 
 def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
-    """Pivot all grasps until the last one is at its optimum."""
+    """Run the simplex method for all grasps at once, until the last one is at its optimum."""
     b, m, _ = wrench.shape
     row = torch.arange(b, device=wrench.device)
     mean = wrench.mean(1)
@@ -176,15 +176,15 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
 def closed_exact(
     points: Vectors, normals: Vectors, friction: float, guess: Float[Tensor, "b m"] | None = None
 ) -> Bool[Tensor, "b"]:
-    """Tell which contacts have frictional form closure with round cones.
+    """Return which contact sets have frictional form closure with round cones.
 
-    Degenerate and non-finite rows are not closed, nor are those at the very border.
+    Degenerate, non-finite and borderline sets are not closed.
 
     Args:
-        points: three to five a row.
+        points: contact points, three to five in a set.
         normals: outward unit normals.
         friction: coefficient of friction.
-        guess: `first_balance` of similar contacts. It saves time for four or five contacts; None: no guess.
+        guess: coefficients phi from `first_balance` for similar contacts, to save time; None: no guess.
     """
     if points.shape[1] == 3:
         return _closed_in_plane(points, normals, friction) & ~degenerate(points)
@@ -192,12 +192,12 @@ def closed_exact(
 
 
 def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[Tensor, "b m"]:
-    """Return the balance of the greatest margin of the edges with which a proof begins; any where nothing balances."""
+    """Return coefficients phi of the greatest margin for cones with few edges; arbitrary if none balance."""
     return solve_closure_lp(wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2))[0]
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
-    """Decide for three contacts.
+    """Return which sets of three contacts are closed.
 
     Balanced forces lie in the plane of the contacts. Each cone cuts an angle about the projected normal from it. The
     six planar wrenches along these angles must positively span the planar wrenches: no plane through two of them has
@@ -228,7 +228,7 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
 def _closed_by_proof(
     points: Vectors, normals: Vectors, friction: float, guess: Float[Tensor, "b m"] | None
 ) -> Bool[Tensor, "b"]:
-    """Decide for more contacts, row by row until it is proven."""
+    """Return which sets of four or five contacts are closed: cones get more edges until each verdict is proven."""
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches
         return closed
@@ -251,12 +251,12 @@ def _closed_by_proof(
 
 
 def _balances(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Bool[Tensor, "b"]:
-    """Tell whether coefficients are positive and balance."""
+    """Return whether coefficients phi are positive and balance the wrenches."""
     return ((phi[:, None] @ wrench)[:, 0].abs().amax(-1) <= BALANCED) & (phi.amin(-1) > BALANCED)
 
 
 def _corrected(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Float[Tensor, "b m"]:
-    """Return the balance with the least relative changes of given coefficients, of either sign."""
+    """Return the balancing coefficients with the smallest relative change from given ones; they may be negative."""
     weighted = phi.square()[..., None] * wrench
     factor, _ = torch.linalg.cholesky_ex(wrench.mT @ weighted)
     dual = torch.cholesky_solve((phi[:, None] @ wrench).mT, factor)
@@ -266,7 +266,7 @@ def _corrected(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Flo
 def most_opposing(
     points: Vectors, normals: Vectors, friction: float, witness: Float[Tensor, "b 6"]
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 6"]]:
-    """Return the least product of a wrench with the forces of normal component 1 at each contact, and their wrenches.
+    """Return, for each contact, the wrench in its round cone with the least product with the witness, and this product.
 
     With u = witness force + witness torque x arm, a force pushes along u at least where its friction points against the
     tangential part of u.

@@ -1,7 +1,7 @@
-"""The probability that contacts are closed on the true surface.
+"""The probability that a grasp has force closure on the true surface, given the uncertain shape.
 
-Each contact approaches along its normal. The Gaussian process of the shape is drawn along these lines, and the drawn
-surfaces give the points and normals at which the fingertips touch.
+Each fingertip approaches along the normal of its contact. Random surfaces are drawn from the Gaussian process along
+these lines, and give the points and normals at which the fingertips touch.
 """
 
 import dataclasses
@@ -34,13 +34,13 @@ OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 
 
 @dataclasses.dataclass(frozen=True)
 class LinePosterior(Batch):
-    """The joint Gaussian of signed distance d and gradient w along the lines x + t n through contacts, from outside in.
+    """The joint Gaussian of signed distance d and its gradient w along the lines x + t n through the contacts.
 
     Args:
         points: planned contacts x, normalised.
         normals: outward unit normals n.
-        deviation: standard deviation of the surface at the contact, the unit of nodes and grid.
-        distance: mean of d on the grid.
+        deviation: standard deviation of the surface at the contact; nodes and grid are multiples of it.
+        distance: mean of d at the grid points, from outside to inside.
         slope: mean of w at the nodes.
         root: symmetric root of the covariance of the z = 20 f values (d, w) at the nodes, line by line, node by node.
     """
@@ -55,18 +55,18 @@ class LinePosterior(Batch):
 
 @functools.cache
 def grid() -> Float[Tensor, "23"]:
-    """Return the grid in standard deviations, from outside in."""
+    """Return the 23 grid positions on a line, in standard deviations, from outside to inside."""
     return torch.tensor([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64)
 
 
 @functools.cache
 def grid_weights() -> Float[Tensor, "23 5"]:
-    """Return the weights of the nodes in the deviations on the grid."""
+    """Return the weights (23, 5) that interpolate deviations at the nodes of a line to its grid."""
     return interpolation(grid(), torch.tensor(NODES, dtype=torch.float64))
 
 
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
-    """Return the weights of descending nodes at each place: linear between, constant outside."""
+    """Return the weights that interpolate linearly between nodes in descending order; constant outside."""
     held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
     gaps = nodes[:-1] - nodes[1:]
     share = ((nodes[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
@@ -74,17 +74,17 @@ def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[T
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
-    """Tell which rows are a footprint or more inside the domain."""
+    """Return which contact sets lie inside the domain, at least a fingertip's footprint from its edge."""
     radius = torch.linalg.vector_norm(shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1)
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
-    """Return the posterior of the surface along the fingers' lines.
+    """Return the posterior of the surface along the normals of all contacts.
 
     Raises:
-        BadArgument: contacts of a wrong shape, not finite, within a footprint of the domain's edge, or without unit
-            normals.
+        BadArgument: contacts of a wrong shape, not finite, within a footprint of the domain's edge, or normals not of
+            length 1.
     """
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
@@ -109,7 +109,7 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
 
 
 def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
-    """Tell which entries of the nodes' covariance belong to two contacts of a wall."""
+    """Return which covariance entries belong to two contacts on the same wall, given which contacts are on it."""
     own = own.repeat_interleave(4 * len(NODES), 1)
     return own[:, :, None] & own[:, None]
 
@@ -117,7 +117,7 @@ def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
 def _along_lines(
     shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]]:
-    """Return deviation, distance on the grid, slope and covariance at the nodes for a single surface."""
+    """Return standard deviation, mean distance on the grid, mean gradient and covariance at the nodes, for one wall."""
     # Rows whose joint posterior is made at a time: 105 x 105 distances of three contacts, which stay in the cache
     rows_per_chunk = 32
     jet = shape.jet(points.flatten(0, 1))
@@ -136,7 +136,7 @@ def _along_lines(
 def node_covariance(
     shape: ShapeGP, points: Vectors, normals: Vectors, nodes: Float[Tensor, "b f 5"]
 ) -> Float[Tensor, "b z z"]:
-    """Return the posterior covariance of (d, w) at the nodes, w by difference quotients of d.
+    """Return the posterior covariance of (d, w) at all nodes; the gradient w is a difference quotient of d.
 
     Nodes outside the domain take the covariance at its edge.
     """
@@ -158,7 +158,7 @@ def node_covariance(
 def first_contact(
     lines: LinePosterior, drawn: Float[Tensor, "b n z"]
 ) -> tuple[Float[Tensor, "b n f 3"], Float[Tensor, "b n f 3"]]:
-    """Return where the fingers stop for drawn deviations, and the normals there; NaN without a surface."""
+    """Return where fingertips touch n drawn surfaces, and the normals there; NaN where a line meets no surface."""
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
     distance = lines.distance[:, None] + deviation[..., 0] @ grid_weights().to(drawn).T
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
@@ -177,7 +177,7 @@ def first_contact(
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The `probability` that the contacts of each row are closed, with its `standard_error`.
+    """The `probability` that each contact set is closed on the true surface, with its `standard_error`.
 
     >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
     tensor([0.9700])
@@ -196,18 +196,18 @@ def closure_probability(
     n: Annotated[int, Range(1, 10**8)] = 2500,
     seed: Seed = 0,
 ) -> ClosureProbability:
-    """Return how probable closure is on the uncertain surface, by Monte Carlo.
+    """Return the probability of force closure on the uncertain surface, by Monte Carlo.
 
-    All rows share the draws, and no row depends on another.
+    All contact sets share the random draws, and no result depends on another set.
 
     Args:
-        shape: the posterior.
-        contacts: three to five a row [m], of any planner, with outward unit normals, inside the domain of the shape. A
-            finger that meets no surface within 12 standard deviations of its contact does not close.
-        spec: its `friction` counts, that of execution, not `planned_friction`.
-        n: number of draws. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is that of
-            (k + 1) / (n + 2) for k closed draws, and so never 0.
-        seed: of the draws.
+        shape: the uncertain shape.
+        contacts: sets of 3 to 5 contacts [m] with outward unit normals, inside the domain of the shape. A draw in which
+            a finger meets no surface within 12 standard deviations is not closed.
+        spec: gives the friction of execution, `friction`; `planned_friction` is not used.
+        n: number of draws. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is that of (k + 1) / (n +
+            2) for k closed draws, and so never 0.
+        seed: random seed.
 
     Raises:
         BadArgument: a wrong argument, or a contact that is not finite or outside the shape's domain.
@@ -227,7 +227,7 @@ def closure_probability(
 
 
 def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the share of n draws that are closed; 0 at the edge of the domain."""
+    """Return the fraction of n drawn surfaces on which each contact set is closed; 0 at the edge of the domain."""
     inside = well_inside(shape, contacts)
     share = contacts.points.new_zeros(len(contacts))
     share[inside] = closed_share(line_posterior(shape, contacts[inside]), friction, n, seed).to(share)
@@ -235,7 +235,7 @@ def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
 
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the share of n drawn surfaces on which the fingers' contacts are closed."""
+    """Return the fraction of n drawn surfaces on which each contact set is closed."""
     draws_per_chunk = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
     gpu_draws = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
     generator = torch.Generator().manual_seed(seed)

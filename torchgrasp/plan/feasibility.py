@@ -1,4 +1,4 @@
-"""Whether contacts satisfy the problem: flatness of the surface around them, and every other constraint."""
+"""Constraint checks of planned contacts: flatness of the surface around each contact, and all other constraints."""
 
 import dataclasses
 import math
@@ -33,17 +33,17 @@ INSIDE = 0.95  # share of the largest variation that guiding points allow: the j
 
 
 def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
-    """Return n unit tangents around each contact: a cone of friction 1 without its axis."""
+    """Return n unit tangents around each contact, equally spaced."""
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
 def normal_variation(
     shape: Shape, points: Vectors, normals: Vectors, radius: float, among: Bool[Tensor, "b f"] | None = None
 ) -> Float[Tensor, "b f"]:
-    """Return the largest angle [rad] between the normals at a contact and on its ring of a radius [m].
+    """Return the largest angle [rad] between the normal at a contact and the normals on a ring of a `radius` [m].
 
-    The ring of a contact on a thin wall is on that side of it, though it may lie nearer to the other. Contacts that are
-    not `among` those asked for have infinite angles.
+    On a thin wall all points of the ring are taken on the contact's side. Contacts outside the mask `among` have
+    infinite angles.
     """
     variation = torch.full_like(points[..., 0], math.inf)
     among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
@@ -56,13 +56,13 @@ def normal_variation(
 
 
 def _owned(shape: Shape, points: Vectors, number: int) -> Bool[Tensor, "b f"]:
-    """Tell which contacts are on one wall of a shape of several."""
+    """Return which contacts are on the wall of a given number."""
     owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009 a shape of one wall need not tell
     return owner[:, number].unflatten(0, points.shape[:2])
 
 
 def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
-    """Return the same for points near one surface."""
+    """Return the largest angle [rad] between each contact's normal and the normals at its ring, on one surface."""
     _, gradient = shape.mean_and_gradient(project(shape, ring, steps=1).flatten(0, 1))
     there = unit(gradient).view_as(ring)
     here = normals[:, None].expand_as(there)
@@ -72,9 +72,9 @@ def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[T
 
 @dataclasses.dataclass(frozen=True)
 class FlatnessConstraint(Batch):
-    """Values <= 0 on flat surface, linear about the points `at` of their evaluation, by their 3 f coordinates.
+    """Constraint values that are <= 0 where the surface is flat, linear in the 3 f coordinates about the points `at`.
 
-    A ring costs as much as several steps of a solver: evaluate it rarely.
+    The surface normals on the ring cost as much as several steps of a solver: evaluate the constraint rarely.
     """
 
     value: Float[Tensor, "b k"]
@@ -82,14 +82,14 @@ class FlatnessConstraint(Batch):
     at: Vectors
 
     def values(self, points: Vectors) -> Float[Tensor, "b k"]:
-        """Return the values at points nearby."""
+        """Return the values at nearby points, by the linear model."""
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
 def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
-    """Evaluate |n - n_k| for the normals at a contact and on its ring, less the chord of `flatness` [rad].
+    """Return |n - n_k| for the normals n at a contact and n_k on its ring, less the chord of `flatness` [rad].
 
-    Values are lengths: chords times the ring's `radius` [m], normalised.
+    The values are lengths, chords times the ring's radius in normalised units; `radius` is in m.
     """
     found, *others = (_wall_constraint(wall, points, flatness, radius) for wall in walls_of(shape))
     for number, other in enumerate(others, start=1):
@@ -103,7 +103,7 @@ def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: 
 
 
 def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
-    """Return the same of one surface."""
+    """Return the flatness constraint for contacts on one surface."""
     jet, radius = triple_mean_jet(shape, points), radius / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
@@ -128,7 +128,7 @@ ON_SURFACE = 1e-6
 
 
 def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> ContactPlan:
-    """Evaluate contacts at normalised `points` against every constraint."""
+    """Return the plan of contacts at normalised `points`, with the first constraint that each contact set violates."""
     jet = triple_jet(shape, points)
     normals, metres = jet.normals, shape.metres(points)
     wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
@@ -167,7 +167,7 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> Conta
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
-    """Return the first status whose condition a row does not meet, in the dictionary's order; else OK."""
+    """Return the first status, in the dictionary's order, whose condition is false; OK if all are true."""
     met = torch.stack(list(good.values()))
     codes = torch.tensor([*good, Status.OK], device=met.device)
     return codes[torch.where(met.all(0), len(good), (~met).to(torch.uint8).argmax(0))]

@@ -39,17 +39,17 @@ MAX_FRICTION = 10.0  # tangent of the widest friction cones in which forces are 
 
 
 def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
-    """Return the map from the n = 3 f numbers of the forces at `points` to force and torque about their centre."""
+    """Return the grasp map: from the 3 f components of forces at `points` to force and torque about their centroid."""
     arms = points - points.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
     return torch.cat([torch.cat([eye] * arms.shape[-2], -1), torch.cat(skew(arms).unbind(-3), -1)], -2)
 
 
 def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"]:
-    """Return unit pushes between the p pairs of contacts: `[..., k, i, :]` is the force at contact i under push k.
+    """Return unit internal forces of all p pairs of contacts: `[..., k, i, :]` acts on contact i in pair k.
 
-    The forces and torques of each push cancel. The pushes span the null space of the grasp map, except for four or
-    five contacts in one plane. The order of pairs is that of `contact_pairs`.
+    The two forces of a pair cancel. All pairs span the null space of the grasp map, except for four or five contacts in
+    one plane. `contact_pairs` gives the order.
     """
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)
@@ -58,7 +58,7 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
 
 
 def tangential_ratio(forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b f"]:
-    """Return the ratio of tangential to normal force; infinite where a contact does not push."""
+    """Return the ratio of tangential to normal force at each contact; infinite where a force does not push."""
     push = -(forces * normals).sum(-1)
     tangential = torch.linalg.vector_norm(forces + push[..., None] * normals, dim=-1)
     return torch.where(push > 0, tangential / push.clamp_min(1e-12), torch.inf)
@@ -71,16 +71,16 @@ def least_friction_forces(
     strongest: Positive = 4.0,
     preferred: Annotated[Float[Tensor, "*#b f"], ANY] | None = None,
 ) -> Float[Tensor, "*b f 3"]:
-    """Return the balanced forces of the fingers on the object [N] that need the least friction.
+    """Return balanced fingertip forces on the object [N] that need the least friction.
 
-    The forces of three contacts lie in the friction cones whenever any balanced forces do, up to the weight of even
-    forces. The forces of four or five contacts may need a slightly larger tangent than the least one.
+    Forces of three contacts lie in the friction cones whenever any balanced forces do, up to a small weight for even
+    forces. Forces of four or five contacts may need slightly more friction than the least.
 
     Args:
         points: contacts [m].
         normals: outward unit normals of the object.
         strongest: normal force of the strongest finger [N].
-        preferred: proportions of the normal forces, preferred among forces of similar friction; None: equal.
+        preferred: preferred ratios of the normal forces, among forces of similar friction; None: equal.
 
     Returns:
         Forces; NaN rows where no balanced forces push at all contacts.
@@ -108,7 +108,7 @@ def least_friction_forces(
 def _search_forces(
     points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], preferred: Float[Tensor, "b 3"] | None
 ) -> Float[Tensor, "b 3 3"]:
-    """Return the forces of three contacts, of any scale; NaN where none push everywhere."""
+    """Return the balanced forces of three contacts, of any scale; NaN where none push at all contacts."""
     sides = points[:, [1, 2, 0]] - points
     sides = sides / ((sides * sides).sum(-1) ** 0.5)[..., None]
     basis = pull_signs(3, points.device).T[..., None] * sides[:, :, None]
@@ -138,7 +138,7 @@ def _search_forces(
 
 @functools.cache
 def _search_steps() -> tuple[Float[Tensor, "3 s"], ...]:
-    """Return the steps that each round of the search tries: all directions first, then shorter and shorter ones."""
+    """Return the steps that each round of the search tries: all directions first, then ever shorter steps."""
     with torch.device("cpu"):  # whatever the default device is
         first, near = (fibonacci_sphere(n, GOLDEN_ANGLE, 0.0) for n in (DIRECTIONS, NEIGHBOURS))
         around = torch.cat([near.new_zeros(1, 3), near]).T
@@ -195,7 +195,7 @@ def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "
 
 
 def _pushing_forces(points: Vectors, normals: Vectors) -> Vectors:
-    """Return balanced forces that push at every contact, NaN where there are none within `MAX_FRICTION`."""
+    """Return balanced forces that push at every contact; NaN where none exist within `MAX_FRICTION`."""
     wrench = wrenches(points, normals, MAX_FRICTION, edges=4)
     phi, _ = solve_closure_lp(wrench.flatten(1, 2))
     forces = (phi.unflatten(1, wrench.shape[1:3])[..., None] * wrench[..., :3]).sum(2)
@@ -203,7 +203,7 @@ def _pushing_forces(points: Vectors, normals: Vectors) -> Vectors:
 
 
 def _null_space(points: Vectors) -> Float[Tensor, "b f 3 k"]:
-    """Return an orthonormal basis of the k = 3 f - 6 dimensions of forces that balance."""
+    """Return an orthonormal basis (k = 3 f - 6) of the forces that balance."""
     wrench = grasp_map(points / centre_and_radius(points)[1])
     return torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:].unflatten(1, points.shape[1:])
 
@@ -211,7 +211,7 @@ def _null_space(points: Vectors) -> Float[Tensor, "b f 3 k"]:
 def _sizes(
     push: Float[Tensor, "b f k"], slide: Float[Tensor, "b f 3 k"], z: Float[Tensor, "b l k"]
 ) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:
-    """Return the normal and tangential forces of l combinations."""
+    """Return the sizes of normal and tangential forces for l coordinate vectors z."""
     tangential = (slide.flatten(1, 2) @ z.mT).unflatten(1, slide.shape[1:3])  # (b, f, 3, l)
     return z @ push.mT, torch.linalg.vector_norm(tangential, dim=2).mT
 
@@ -219,6 +219,6 @@ def _sizes(
 def _needed(
     push: Float[Tensor, "b f k"], slide: Float[Tensor, "b f 3 k"], z: Float[Tensor, "b k"]
 ) -> Float[Tensor, "b"]:
-    """Return the greatest ratio of tangential to normal force."""
+    """Return the largest ratio of tangential to normal force over the contacts: the friction needed."""
     normal, tangential = _sizes(push, slide, z[:, None])
     return (tangential / normal)[:, 0].amax(1)

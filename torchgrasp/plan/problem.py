@@ -33,7 +33,7 @@ LEAST_SIDE = 0.05
 
 @runtime_checkable
 class Shape(Protocol):
-    """A `ShapeGP`, or another implicit surface with an uncertainty.
+    """The interface of a shape with uncertainty: a `ShapeGP`, or another implicit surface.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> shape = fit_shape(load_object("jug").view)
@@ -58,57 +58,58 @@ class Shape(Protocol):
 
 
 def device_of(shape: Shape) -> torch.device:
-    """Return the device of a shape, by default the CPU."""
+    """Return the device of a shape; the CPU if it has none."""
     return getattr(shape, "device", torch.device("cpu"))
 
 
 def walls_of(shape: Shape) -> tuple[Shape, ...]:
-    """Return the surfaces of a shape, each as a shape: two of an open vessel, else the shape itself."""
+    """Return the surfaces of a shape, each as a shape: two for an open vessel, else the shape itself."""
     return getattr(shape, "walls", (shape,))
 
 
 def triple_jet(shape: Shape, points: Vectors) -> SurfaceJet:
-    """Return mean, variance and derivatives of the shape at all contacts of all rows."""
+    """Return mean, variance and derivatives of the shape at all contacts."""
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))
 
 
 def triple_mean_jet(shape: Shape, points: Vectors) -> MeanJet:
-    """Return mean distance and derivatives at all contacts, without the variance if the shape can leave it out."""
+    """Return the mean signed distance and its derivatives at all contacts, without the variance where possible."""
     jet = getattr(shape, "mean_jet", shape.jet)(points.flatten(0, 1))
     return MeanJet(*(x.unflatten(0, points.shape[:2]) for x in (jet.distance, jet.gradient, jet.hessian)))
 
 
 def with_variance(jet: MeanJet, variance: Float[Tensor, "b f"], gradient: Float[Tensor, "b f 3"]) -> SurfaceJet:
-    """Return the mean's derivatives with a variance that was found elsewhere."""
+    """Return the mean's derivatives together with a given variance and its gradient."""
     return SurfaceJet(jet.distance, jet.gradient, jet.hessian, variance, gradient)
 
 
 @functools.cache
 def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
-    """Return all pairs of contacts: each with the next, then each with the one after it."""
+    """Return the indices of all p pairs of contacts: neighbours (i, i + 1) first, then (i, i + 2)."""
     order = [(i, (i + gap) % fingertips) for gap in range(1, fingertips // 2 + 1) for i in range(fingertips)]
     return torch.tensor(order[: fingertips * (fingertips - 1) // 2], device=device).T
 
 
 @functools.cache
 def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
-    """Return 1 where a contact is the first of a pair, -1 where it is the second: the sense of its pull along it."""
+    """Return 1 where a contact is the first of a pair, -1 where it is the second, else 0."""
     pairs = contact_pairs(fingertips, device)
     at = torch.arange(fingertips, device=device)[:, None]
     return (at == pairs[0]).double() - (at == pairs[1]).double()
 
 
 def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Float[Tensor, "b p"]]:
-    """Return the part of the points and that of the tensions: u = 3 f + f (f - 1) / 2 unknowns have f points."""
+    """Return the f points (f, 3) and the tensions of the pairs out of a vector of u unknowns."""
     fingertips = (math.isqrt(25 + 8 * x.shape[1]) - 5) // 2
     return x[:, : 3 * fingertips].unflatten(1, (fingertips, 3)), x[:, 3 * fingertips :]
 
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values of the constraints, and Jacobians by u unknowns: coordinates, then tensions.
+    """Values of all constraints, and their Jacobians by the u unknowns: coordinates, then tensions.
 
-    `bounds` are f cones, f variances, f of the domain, p distances of pairs, and with a table f heights.
+    `bounds` holds f friction cones, f variances, f domain limits, p distances between contacts and, with a table, f
+    heights.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -120,19 +121,19 @@ class Constraints(Batch):
 
     @property
     def values(self) -> Float[Tensor, "b r"]:
-        """Centre, surface and bounds, one after the other."""
+        """All values: centre, surface and bounds, concatenated."""
         return torch.cat([self.centre, self.surface, self.bounds], 1)
 
     @property
     def jacobian(self) -> Float[Tensor, "b r u"]:
-        """The derivatives of `values`."""
+        """The Jacobian of `values`."""
         return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 
 def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
-    """Return the forces on the object at the contacts, and the sides from the first to the second of each pair.
+    """Return the forces on the object at the contacts, and the vector from the first to the second of each pair.
 
-    A tension pulls the ends of its side together, in proportion to its length.
+    The tension of a pair pulls its two contacts together with a force of tension times distance.
     """
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]
@@ -141,9 +142,10 @@ def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> tupl
 
 @dataclasses.dataclass(frozen=True)
 class ContactProblem:
-    """Eqs. (10)-(14) and the margins of `ContactSpec`, in the normalised units of one shape.
+    """The contact planning problem, Eqs. (10)-(14), in the normalised units of one shape.
 
-    `friction` is that of the round cone inside the cone with edges. `separation` is at least `LEAST_SIDE`.
+    `friction` is the coefficient of the round cone inside the linearised cone. `separation` is the least distance of
+    two fingertip centres.
     """
 
     fingertips: int
@@ -156,7 +158,7 @@ class ContactProblem:
 
     @classmethod
     def of(cls, shape: Shape, spec: ContactSpec) -> "ContactProblem":
-        """Return the problem of a shape and a specification."""
+        """Return the problem of a shape and a contact specification."""
         table, scale = spec.plane, float(shape.scale)
         if table is not None:
             foot = table.offset * table.normal
@@ -172,20 +174,20 @@ class ContactProblem:
         )
 
     def room(self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return how much higher contacts are than they must be: at 0 a round fingertip rests on the table."""
+        """Return how far each contact is above its least height, at which a round fingertip rests on the table."""
         if self.table is None:
             return torch.full_like(points[..., 0], math.inf)
         slant = 1 - normals @ self.table.normal.to(normals)
         return self.table.height(points) - self.tip_radius * slant
 
     def sides(self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p 3"]:
-        """Return the sides between the tips' centres, from the first to the second of each pair."""
+        """Return the vectors between fingertip centres, from the first to the second of each pair."""
         centres = points + self.tip_radius * normals
         first, second = contact_pairs(points.shape[-2], points.device)
         return centres[..., second, :] - centres[..., first, :]
 
     def constraints(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Constraints:
-        """Evaluate all constraints and their Jacobians; `jet` is the shape at the points."""
+        """Evaluate all constraints and their Jacobians; `jet` holds the shape's values at the points."""
         b, f = points.shape[:2]
         unknowns = 3 * f + tension.shape[1]
         own = functools.partial(_by_own_point, unknowns=unknowns)
@@ -219,7 +221,7 @@ class ContactProblem:
     def _distances(
         self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]
     ) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b p u"]]:
-        """Return by how much each pair of tip centres is too near, with derivatives."""
+        """Return by how much each pair of fingertip centres is too close, with derivatives."""
         sides = self.sides(points, normals)
         length = torch.linalg.vector_norm(sides, dim=-1)
         along = (sides / length[..., None])[..., None, :]
@@ -234,7 +236,7 @@ class ContactProblem:
     def _cones(
         self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet
     ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f u"]]:
-        """Return by how much each force leaves its cone, as a cosine.
+        """Return by how much each force is outside its friction cone, as a cosine, with derivatives.
 
         With u = f / |f| the bound is n.u + cosine. Its derivatives are (1 - u u^T) n / |f| by the force, and u by the
         normal, which turns with its point.
@@ -260,7 +262,7 @@ class ContactProblem:
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:
-    """Return the Jacobian of a value at each point by all unknowns: each depends on its own point alone."""
+    """Return the Jacobian by all unknowns of values that each depend on their own contact point only."""
     b, f = slope.shape[:2]
     jacobian, at = slope.new_zeros(b, f, unknowns), torch.arange(f, device=slope.device)
     jacobian[:, :, : 3 * f].unflatten(2, (f, 3))[:, at, at] = slope

@@ -1,4 +1,4 @@
-"""From a shape with uncertainty to contacts: Eqs. (10)-(14) solved from many starts at once."""
+"""The contact planner: solves Eqs. (10)-(14) on an uncertain shape, from many initial guesses at once."""
 
 import itertools
 import time
@@ -43,18 +43,18 @@ def plan_contacts(
     *,
     time_budget: Positive | None = None,
 ) -> ContactPlan:
-    """Plan `spec.fingertips` contacts from each of many starts, Eqs. (10)-(14): one row a start, in their order.
+    """Plan sets of `spec.fingertips` contacts, Eqs. (10)-(14), one set for each initial guess, in their order.
 
-    A failed row carries the `Status` of the first constraint it violates. Where a descent fails, a feasible start is
-    itself the plan. Without `time_budget` the result is deterministic. A plan from 500 or 1000 starts begins one from
-    more.
+    A failed set carries the `Status` of the first constraint that it violates. If the solver fails from a feasible
+    initial guess, the guess itself is the result. Without `time_budget` the result is deterministic, and a plan from
+    500 or 1000 starts is the beginning of a plan from more.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
-        spec: what the contacts must satisfy; `ContactSpec()` by default.
-        starts: number of starts, drawn from the sphere of `spec.start_radius` (Sec. 6.2), or starting points [m].
-        seed: seed of the draw.
-        time_budget: seconds of wall time for the call. As many starts are planned as will fit, at least 25. None: all.
+        spec: the constraints on contacts; `ContactSpec()` by default.
+        starts: number of random initial guesses (Sec. 6.2), or the initial contact points [m].
+        seed: random seed.
+        time_budget: wall time [s] of the call; at least 25 starts are planned. None: all starts are planned.
 
     Raises:
         BadArgument: `starts` not positive, of a wrong shape, or outside the shape's domain, or another wrong argument.
@@ -77,7 +77,7 @@ def plan_contacts(
 
 
 def _chunks(shape: Shape, settled: Settled, starts: int | Vectors, seed: int) -> Iterator[Chunk]:
-    """Yield starts and stages, chunk by chunk."""
+    """Yield the initial guesses chunk by chunk, each with the solver stages that it needs."""
     if isinstance(starts, Tensor):
         return ((first, SEARCH) for first in given_starts(shape, starts))
     first_stages = _stages(settled.spec)
@@ -85,12 +85,12 @@ def _chunks(shape: Shape, settled: Settled, starts: int | Vectors, seed: int) ->
 
 
 def _stages(spec: ContactSpec) -> tuple[Stage, ...]:
-    """Return the stages from drawn starts."""
+    """Return the solver stages for random initial guesses."""
     return SEARCH if spec.flatness is None else TO_CENTRE
 
 
 def plan_in_turn(shape: Shape, settled: Settled, sizes: Sequence[int], seed: int) -> Iterator[ContactPlan]:
-    """Yield a plan from `sizes[k]` further starts each time that one is asked for."""
+    """Yield one plan after another; plan k comes from `sizes[k]` new initial guesses."""
     chunks, spec = [chunk_sizes(size) for size in sizes], settled.spec
     starts = drawn_starts(shape, settled, itertools.chain(*chunks), seed)
     for parts in chunks:
@@ -98,7 +98,7 @@ def plan_in_turn(shape: Shape, settled: Settled, sizes: Sequence[int], seed: int
 
 
 def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
-    """Yield as many starts as will be planned in time, at the pace so far."""
+    """Yield as many initial guesses as can be planned in the given time, judged by the speed so far."""
     began, done, fits = time.monotonic(), 0, LEAST_STARTS
     for first, stages in chunks:
         while len(first) > 0:
@@ -112,7 +112,7 @@ def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 
 
 def plan_chunk(shape: Shape, spec: ContactSpec, first: Vectors, stages: tuple[Stage, ...]) -> ContactPlan:
-    """Plan from normalised starts on the surface."""
+    """Return the contact plan from initial guesses on the surface, in normalised units."""
     problem = ContactProblem.of(shape, spec)
     state = start_state(shape, first)
     for stage in (*stages, FINISH):

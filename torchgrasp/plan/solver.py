@@ -1,7 +1,7 @@
-"""The solver of a `ContactProblem`: Levenberg-Marquardt along the surface.
+"""The solver of a `ContactProblem`: Levenberg-Marquardt steps along the surface.
 
-After every step one Newton step of the mean brings the points back to the surface. It costs a fraction of a full
-evaluation, and steps may be long.
+After every step one Newton step on the mean signed distance brings the points back to the surface. It costs a fraction
+of a full evaluation, and allows long steps.
 """
 
 import dataclasses
@@ -36,10 +36,10 @@ BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cone
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """At most so many steps with constant weights of centre (Eq. 14) and cones (Eq. 13).
+    """A solver stage: at most `steps` steps with constant weights of `centre` (Eq. 14) and friction `cones` (Eq. 13).
 
-    A row rests when its next step is shorter than `settled`. The variance, which costs more than all else, is evaluated
-    at every step, or if not `exact` extrapolated from the start.
+    A contact set stops when its next step is shorter than `settled`. With `exact` the variance, the most expensive
+    value, is evaluated at every step; without, it is extrapolated linearly from the first state.
     """
 
     centre: float
@@ -54,7 +54,7 @@ FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)  # th
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """Normalised contacts, the internal force between each pair of contacts, and the shape at the contacts."""
+    """The solver's state: normalised contacts, the tension between each pair, and the shape at the contacts."""
 
     points: Vectors
     tension: Float[Tensor, "b p"]
@@ -63,9 +63,9 @@ class State(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """Weighted residuals, their weights, and the Jacobian without weights.
+    """The linearised constraints: weighted residuals, their weights, and the Jacobian without weights.
 
-    `inside`: all points are in the domain.
+    `inside` says whether all points are in the domain.
     """
 
     residual: Float[Tensor, "a r"]
@@ -81,14 +81,14 @@ class LinearConstraints(Linearisation):
 
 @dataclasses.dataclass(frozen=True)
 class Descent(Problem[State, LinearConstraints]):
-    """The cost of a stage: half the sum of weighted squares."""
+    """The least-squares problem of one stage: half the sum of squared weighted constraints."""
 
     shape: Shape
     problem: ContactProblem
     stage: Stage
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
-        """Evaluate the constraints; bounds that hold weigh nothing."""
+        """Evaluate the constraints at a state; satisfied bounds have weight 0."""
         constraints = self.problem.constraints(state.points, state.tension, state.jet)
         bounds = torch.full_like(constraints.bounds, BOUNDS)
         bounds[:, : state.points.shape[1]] = self.stage.cones
@@ -101,7 +101,7 @@ class Descent(Problem[State, LinearConstraints]):
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside)
 
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
-        """Return the damped step, no point farther than `LONGEST_STEP`. Rows without a factor rest."""
+        """Return the damped step, in which no point moves farther than `LONGEST_STEP`; NaN for a singular matrix."""
         jacobian = model.weighted_jacobian
         scale = jacobian.new_ones(1, jacobian.shape[2])
         split_unknowns(scale)[1][:] = TENSION_DAMPING
@@ -115,7 +115,7 @@ class Descent(Problem[State, LinearConstraints]):
         return x / shrink[:, None], length / shrink > self.stage.settled  # NaN is not longer
 
     def move(self, state: State, x: Float[Tensor, "a u"]) -> State:
-        """Return the contacts moved along the surface."""
+        """Return the state after a step x; the contacts move along the surface."""
         by_points, by_tension = split_unknowns(x)
         points = project(self.shape, state.points + by_points, steps=1)
         tension = normalise_tensions(points, state.tension + by_tension)
@@ -128,34 +128,34 @@ class Descent(Problem[State, LinearConstraints]):
     def judge(
         self, model: LinearConstraints, trial: LinearConstraints, x: Float[Tensor, "a u"], damping: Damping
     ) -> Verdict:
-        """Accept a decrease inside the domain; damp by the kept share of its promise (Nielsen)."""
+        """Return which steps lower the cost inside the domain, and the next damping (Nielsen's rule)."""
         kept = (model.cost - trial.cost) / promised_decrease(model, x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
         eased = damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
         return accepted, torch.where(accepted, eased.clamp(min=1e-9), (4 * damping).clamp(max=1e9))
 
     def refuse(self, model: LinearConstraints, trial: LinearConstraints) -> LinearConstraints:
-        """Return the model with the mean Jacobian of both ends of the step (a bundle of gradients).
+        """Return the model after a rejected step: its Jacobian is the mean of those at both ends of the step.
 
-        Near an observation a thin plate's normals turn in a cusp. Steps from either side lead across it; the mean
-        points down along it.
+        Near an observation a thin plate's normals change abruptly, and steps from either side lead across the kink. The
+        mean Jacobian points down along the kink.
         """
         return dataclasses.replace(model, jacobian=(model.jacobian + trial.jacobian) / 2)
 
 
 def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a u"]) -> Float[Tensor, "a"]:
-    """Return by how much a step lowers the model's cost."""
+    """Return the decrease of the cost that the linear model predicts for a step x."""
     linear = model.residual + (model.weighted_jacobian @ x[..., None])[..., 0]
     return (model.residual.square().sum(1) - linear.square().sum(1)) / 2
 
 
 def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage) -> State:
-    """Return the contacts after a stage."""
+    """Return the contacts after one solver stage."""
     return levenberg_marquardt(Descent(shape, problem, stage), state, stage.steps)[0]
 
 
 def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:
-    """Move normalised points onto f_d = 0 by Newton steps along the gradient."""
+    """Move normalised points onto the surface f_d = 0 by Newton steps along the gradient."""
     x = points.flatten(0, 1)
     for _ in range(steps):
         distance, gradient = shape.mean_and_gradient(x)
@@ -164,17 +164,17 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
 
 
 def start_state(shape: Shape, points: Vectors) -> State:
-    """Return the first state of a descent: contacts with equal internal forces between all pairs."""
+    """Return the solver's first state: contacts with equal tensions between all pairs."""
     return State(points, equal_tensions(points), triple_jet(shape, points))
 
 
 def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
-    """Return equal tensions of all pairs: the forces point to the contacts' centre."""
+    """Return equal tensions of all pairs, for which each force points to the contacts' centroid."""
     pairs = contact_pairs(points.shape[1], points.device).shape[1]
     return normalise_tensions(points, points.new_ones(len(points), pairs))
 
 
 def normalise_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
-    """Return the tensions for which the mean size of the forces is 1."""
+    """Scale the tensions so that the mean size of the forces is 1."""
     force, _ = forces_from_tensions(points, tension)
     return tension / torch.linalg.vector_norm(force, dim=-1).mean(-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Starts of the planner: on the paper's sphere, from candidate contacts, or given."""
+"""Initial guesses of the contact planner: on the paper's sphere, from candidate contacts, or given by the caller."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator
@@ -33,7 +33,7 @@ STARTS_PER_CHUNK = 500  # starts planned at once: memory is bounded, and a plan 
 
 
 def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int) -> None:
-    """Raise `BadArgument` for wrong arguments of `plan_contacts`."""
+    """Raise `BadArgument` for wrong initial guesses of `plan_contacts`."""
     if isinstance(starts, Tensor):
         if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
             allowed = f"as many as spec.fingertips: {spec.fingertips}"
@@ -49,36 +49,36 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: in
 
 
 def given_starts(shape: Shape, starts: Vectors) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield normalised starts on the surface from given points [m]."""
+    """Yield the caller's initial contact points [m], moved onto the surface, in normalised units."""
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
 def chunk_sizes(starts: int) -> list[int]:
-    """Return the numbers of starts that are planned at once."""
+    """Return the numbers of initial guesses that are planned at once."""
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
 
 class Candidates(NamedTuple):
-    """Normalised points of the surface with normals."""
+    """Candidate contacts: normalised points of the surface, with their normals."""
 
     points: Float[Tensor, "p 3"]
     normals: Float[Tensor, "p 3"]
 
 
 class Settled(NamedTuple):
-    """A spec with its `flat_radius`, and the surface points that qualify as contacts, with normals, if it has one."""
+    """A contact specification with a known `flat_radius`, and the candidates on flat surface (None: no flatness)."""
 
     spec: ContactSpec
     candidates: Candidates | None
 
 
 def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield normalised starts on the surface, `sizes[k]` at a time.
+    """Yield random initial guesses on the surface in normalised units, `sizes[k]` at a time.
 
-    Without `spec.flatness` they are the paper's: points of the sphere of `spec.start_radius`, moved onto the surface
-    (Sec. 6.2). With it they are rows of candidates. The centre of a flat grasp may lie 30 mm from the object's, where
-    the paper's starts rarely end.
+    Without `spec.flatness` they are the paper's: points on the sphere of `spec.start_radius`, moved onto the surface
+    (Sec. 6.2). With flatness they are sets of candidate contacts. The centroid of a flat grasp may lie 30 mm from the
+    object's centre, where the paper's guesses rarely lead.
     """
     (spec, candidates), generator = settled, torch.Generator().manual_seed(seed)
     if candidates is not None:
@@ -92,10 +92,10 @@ def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int
 
 
 def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
-    """Return the spec with a `flat_radius`, and the flat points of the surface as candidates for contacts.
+    """Choose the `flat_radius` of a specification that has none, and find the candidate contacts on flat surface.
 
-    A radius that the spec lacks is the widest of `FLAT_RADII` at which enough starts have form closure. If too few
-    points are flat, all points of `survey` are candidates.
+    The radius is the largest of `FLAT_RADII` at which enough initial guesses have form closure. If too few points are
+    flat, all points of `survey` are candidates.
     """
     if spec.flatness is None:
         return Settled(spec, None)
@@ -116,23 +116,23 @@ def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
 
 
 def draw(shape: Shape, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
-    """Return rows of points on the sphere of `spec.start_radius`."""
+    """Return random points on the sphere of `spec.start_radius`, `size` of them, in normalised units."""
     points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64))
     return (spec.start_radius * points).to(device_of(shape))
 
 
 def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
-    """Return points all over the surface, among which candidates are found; of a vessel as many on either wall."""
+    """Return points all over the surface, among which candidates are found; for a vessel half of them on each wall."""
     walls = walls_of(shape)
     drawn = draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator).tensor_split(len(walls))
     return torch.cat([project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)])
 
 
 def draw_in(shape: Shape, points: Vectors) -> Vectors:
-    """Return normalised starts, those off the surface drawn in around the centre.
+    """Return initial guesses in which contact sets far from the surface are moved close to their centroid.
 
-    A point off the surface is only a direction. From far away it ends on the nearest surface, uncertain or not. From
-    near the centre they spread over the surface that faces them, centred as Eq. (14) wants.
+    Far from the surface a point is only a direction. From far away it would end on the nearest surface. From near the
+    centroid the points spread over the surface around it, as Eq. (14) wants.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
@@ -143,7 +143,7 @@ def draw_in(shape: Shape, points: Vectors) -> Vectors:
 
 
 def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tensor, "b f"], Vectors]:
-    """Tell which surface points are certain, inside and above the table; return the normals of all."""
+    """Return which surface points are certain, in the domain and above the table; also all points' normals."""
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1)))
     normals = unit(gradient)
@@ -161,7 +161,7 @@ def candidate_rows(
     starts: int,
     generator: torch.Generator,
 ) -> tuple[Vectors, int]:
-    """Return random rows of candidates, closed and separate as far as there are enough; and how many are."""
+    """Return random sets of candidate contacts, closed and well separated if possible, and the number that are."""
     rows, missing, f = [], starts, problem.fingertips
     for _ in range(ROUNDS):
         choice = torch.randint(len(points), (DRAWN_PER_START * starts, f), generator=generator).to(points.device)

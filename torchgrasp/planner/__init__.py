@@ -1,4 +1,4 @@
-"""From a partial cloud, or a scene, to ranked grasps of a hand."""
+"""The grasp planner: from a partial point cloud, or a scene, to ranked grasps of a hand."""
 
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.grasps import plan_grasps, stream_grasps

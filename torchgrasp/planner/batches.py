@@ -1,4 +1,4 @@
-"""Planning in batches, each larger than the one before, so that the first grasps come early."""
+"""Planning in batches, each larger than the last, so that the first grasps come early."""
 
 import dataclasses
 import time
@@ -38,14 +38,14 @@ OFFERED = 4  # planned rows for each row that the hand tries
 
 
 class Batch(NamedTuple):
-    """Numbers of further starts, and of rows of contacts that the hand tries."""
+    """The size of one batch: the number of new initial guesses, and of contact sets that the hand tries."""
 
     starts: int
     tried: int
 
 
 def schedule(starts: int, most: int) -> list[Batch]:
-    """Return the batches in which `starts` are planned and `most` rows tried; a small rest joins the last batch."""
+    """Return batches with `starts` initial guesses and `most` contact sets in all; a small rest joins the last."""
     batches, size, most = list[Batch](), FIRST, min(most, starts)
     tried = planned = 0
     while tried < most:
@@ -58,18 +58,18 @@ def schedule(starts: int, most: int) -> list[Batch]:
 
 
 class Planner:
-    """Plans grasps in batches.
+    """Plans the grasps of one problem in batches.
 
-    In mode "joint" the hand moves onto fixed contacts first. Where it fails, contacts and hand move together. These
-    sliding contacts are solved in the last batch, because every batch has a fixed cost, or in a batch without any
-    grasp. Other modes have one batch.
+    In mode "joint" the hand first moves onto fixed contacts. Where that fails, contacts and hand move together
+    ("sliding contacts"). Sliding is solved only in the last batch, or in a batch without any grasp, because it has a
+    fixed cost. Other modes have one batch.
     """
 
     def __init__(self, problem: Problem) -> None:
         """Begin without any grasps.
 
-        `unfinished` contacts had few steps while they were fixed, `unsolved` contacts had all steps. Each part comes
-        with the best failures.
+        `unfinished` holds contact sets that had few solver steps, `unsolved` those that had all steps; both with the
+        best failed grasps.
         """
         self.problem, self.pool, self.first = problem, Pool(), True
         self.unfinished, self.unsolved = (list[tuple[SeededContacts, Grasps]]() for _ in range(2))
@@ -77,7 +77,7 @@ class Planner:
     def run(self, deadline: float) -> Iterator[Grasps]:
         """Yield the grasps of each batch in the upright frame, executable ones first; `meta` counts the starts so far.
 
-        No batch begins after `deadline`, of `time.monotonic`.
+        No batch begins after `deadline`, a time of `time.monotonic`.
         """
         problem, request = self.problem, self.problem.request
         check_starts(problem.shape, problem.given_spec, request.starts, request.seed)
@@ -105,13 +105,13 @@ class Planner:
                 return
 
     def _solve_contact_first(self, plan: ContactPlan, tried: int, report: "Report") -> Grasps:
-        """Return grasps on fixed contacts, from the seeds of the learned model."""
+        """Return grasps on fixed contacts, from initial hand postures that the learned model gives."""
         found = find_contacts(self.problem, plan, tried, report.note)
         solve = solve_as_paper if self.problem.request.mode == "paper" else solve_contact_first
         return solve(self.problem.reach(found.contacts, found.certificate), found.seeds)
 
     def _solve_joint(self, plan: ContactPlan | None, tried: int, report: "Report", last: bool) -> Grasps:
-        """Return the grasps of the most promising contacts so far, and of earlier ones that are solved now."""
+        """Return grasps on the most promising contact sets so far, and on sets that earlier batches left unsolved."""
         if plan is not None:
             found = find_contacts(self.problem, plan, OFFERED * tried, report.note)
             self.pool.add(found, contact_costs(self.problem, found))
@@ -133,7 +133,7 @@ class Planner:
         return join([solved, self._with_sliding_contacts(join_seeded(rests), join(failures))])
 
     def _on_fixed_contacts(self, found: SeededContacts, steps: int) -> tuple[Grasps, SeededContacts, Grasps]:
-        """Return grasps on fixed contacts, the contacts without a grasp, and the best failures of these."""
+        """Return grasps on fixed contacts, the contact sets without a grasp, and their best failed grasps."""
         reach = self.problem.reach(found.contacts, found.certificate)
         found = found._replace(seeds=reach.drop_unreachable(found.seeds))
         grasps, row = best_grasps(try_best_seeds(reach, found.seeds, steps))
@@ -141,7 +141,7 @@ class Planner:
         return grasps[solved], found.select(row[~solved]), grasps[~solved]
 
     def _with_sliding_contacts(self, found: SeededContacts, failed: Grasps) -> Grasps:
-        """Return grasps with sliding contacts, or else the best failure of each row."""
+        """Return grasps with sliding contacts, or the best failed grasp of each contact set."""
         attempts = Attempts(torch.ones_like(found.certificate.closed), executable)
         attempts.add(failed, torch.arange(len(failed), device=failed.status.device))
         reach = self.problem.reach(found.contacts, found.certificate)
@@ -152,7 +152,7 @@ class Planner:
 def rank(problem: Problem, solved: Grasps) -> Grasps:
     """Return grasps in the order of the request's ranking, scored by the log-odds of success.
 
-    If the object cannot be lifted out of its surroundings, its grasps are buried.
+    If the object cannot be lifted out of its surroundings, its grasps get the status `BURIED`.
     """
     request, hand = problem.request, problem.hand
     if problem.buried:
@@ -177,16 +177,16 @@ def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:
 
 
 class Report:
-    """Reports each stage once, with the results of all batches, and each batch but the last when it ends."""
+    """Reports progress to the observer: each stage once with the results of all batches, and the end of each batch."""
 
     def __init__(self, problem: Problem, batches: int, planned: int) -> None:
-        """Take the number of batches, and the number of batches with further starts."""
+        """Take the number of batches, and the number of batches that plan new initial guesses."""
         self.problem, self.batches, self.planned = problem, batches, planned
         self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
         self.ended = self.offered = self.closed = 0
 
     def shape(self) -> None:
-        """Report the estimated shape, and the share of its surface that is known to 4 mm."""
+        """Report the estimated shape, and the fraction of its surface with a standard deviation below 4 mm."""
         if self.problem.request.observer is ignore:
             return
         shape, vertices = self.problem.shape, self.problem.surface.vertices
@@ -196,7 +196,7 @@ class Report:
         self.problem.tell("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
 
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
-        """Keep the result of a stage of one batch; `certify` was offered so many rows."""
+        """Store the result of a stage of one batch; `offered` contact sets were given to the stage "certify"."""
         if stage == "query":  # rows are counted through all batches
             value = dataclasses.replace(value, row=value.row + self.closed - len(self.parts["certify"][-1]))
         elif stage == "certify":
@@ -206,13 +206,13 @@ class Report:
             self._tell(stage)
 
     def end_batch(self, grasps: Grasps, last: bool) -> None:
-        """Report a batch that is not the last one planned; after the `last` that is solved, all stages so far."""
+        """Report the end of a batch; after the `last` batch report the stages that are not yet reported."""
         self.ended += 1
         if self.ended < self.batches:
             good = int(executable(grasps).sum())
             best = f", the best {float(grasps.success[0]):.0%} likely" if good else ""
             text = f"{self.ended} of {self.batches}: {good} executable of {len(grasps)}{best}"
-            self.problem.tell("wave", text, grasps)
+            self.problem.tell("batch", text, grasps)
         if last and len(self.parts["plan"]) < self.planned:
             for stage in self.parts:
                 self._tell(stage)
@@ -230,6 +230,6 @@ class Report:
 
 
 def describe(counts: dict[Status, int]) -> str:
-    """Return counts of statuses as one line, the successes first."""
+    """Return the counts of statuses as one line of text, successes first."""
     ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
     return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"

@@ -1,4 +1,4 @@
-"""The single changes of a request that could give grasps: of the hand, of the constraints, and of the world."""
+"""Single changes of a planning request that could give grasps: to the hand, the constraints, or the world."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -21,8 +21,8 @@ OF_HAND = frozenset(status for status in Status if Status.OUT_OF_REACH <= status
 class Change:
     """A request with one change, which `words` describe.
 
-    A `choice` is up to the user; any other change is a fact of the world. `cures` are the failures that it could
-    prevent. `refit` means that the shape is estimated again.
+    With `choice` the user can make the change; without, it is a fact about the world. `cures` are the failures that it
+    could prevent. With `refit` the shape is estimated anew.
     """
 
     words: str
@@ -33,7 +33,7 @@ class Change:
 
 
 def _with(request: Request, **fields: Any) -> Request:
-    """Return the request with other constraints on contacts."""
+    """Return the request with changed fields of its contact specification."""
     return dataclasses.replace(request, spec=dataclasses.replace(request.contact_spec, **fields))
 
 
@@ -44,13 +44,13 @@ def list_changes(request: Request) -> list[Change]:
 
 
 def more_starts(request: Request) -> Change:
-    """Return the change to four times the starts."""
+    """Return the change to four times as many initial guesses."""
     more = dataclasses.replace(request, starts=4 * request.starts)
     return Change(f"with {more.starts} starts", True, frozenset(Status), more)
 
 
 def _fingers(request: Request) -> Iterator[Change]:
-    """Yield the other sets of fingers that the hand declares; in another mode, mode "joint"."""
+    """Yield changes to the other sets of fingers that the hand declares; in other modes, the change to mode "joint"."""
     mode, fingers = request.mode, request.fingers
     if mode != "joint":
         yield Change("with mode='joint'", True, OF_HAND | OPEN, dataclasses.replace(request, mode="joint"), refit=True)
@@ -64,7 +64,7 @@ def _fingers(request: Request) -> Iterator[Change]:
 
 
 def _hands(request: Request) -> Iterator[Change]:
-    """Yield the other shipped hands, without variants such as the left hand."""
+    """Yield changes to the other shipped hands, without variants such as the left hand."""
     if request.mode != "joint":
         return
     names = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))
@@ -100,12 +100,12 @@ def _limits(request: Request) -> Iterator[Change]:
 
 
 def _next(limits: tuple[float, ...], present: float) -> float | None:
-    """Return the first limit above the present one, or None."""
+    """Return the first of `limits` above the present limit, or None."""
     return next((limit for limit in limits if limit > present), None)
 
 
 def _friction(request: Request) -> Iterator[Change]:
-    """Yield the next two coefficients of friction that are clearly higher."""
+    """Yield changes to the next two clearly higher friction coefficients."""
     present = request.contact_spec.friction
     for friction in [f for f in FRICTIONS if f >= 1.4 * present][:2]:
         words = f"if the friction were {friction:g} instead of {present:g}"
@@ -113,7 +113,7 @@ def _friction(request: Request) -> Iterator[Change]:
 
 
 def _surroundings(request: Request) -> Iterator[Change]:
-    """Yield another table, no neighbours, and an arm that reaches every pose."""
+    """Yield changes of the surroundings: another table, no neighbours, an arm that reaches every pose."""
     cloud, spec = request.cloud, request.contact_spec
     if isinstance(cloud, Scene):
         crowded = OF_HAND | {Status.NEIGHBOUR_COLLISION, Status.BURIED}

@@ -1,4 +1,4 @@
-"""Contacts for the hand to try: planned, certified, with postures of the hand as seeds, the most promising first."""
+"""The contact sets that the hand tries: planned, certified, with initial hand postures, the most promising first."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -25,14 +25,14 @@ LIKELY = 2
 
 
 class SeededContacts(NamedTuple):
-    """Closed contacts, their certificates, and the hand's seeds on them."""
+    """Closed contact sets, their certificates, and initial hand postures (seeds) for each set."""
 
     contacts: Contacts
     certificate: Certificate
     seeds: IKSeeds
 
     def select(self, rows: Int[Tensor, "k"]) -> "SeededContacts":
-        """Return some rows of contacts, with their seeds."""
+        """Return the contact sets with given indices, with their seeds."""
         number = rows.new_full((len(self.contacts),), -1)
         number[rows] = torch.arange(len(rows), device=rows.device)
         seeds = self.seeds[number[self.seeds.row] >= 0]
@@ -41,7 +41,7 @@ class SeededContacts(NamedTuple):
 
 
 def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
-    """Return the contacts of all parts, one after the other."""
+    """Return the contact sets of all parts, concatenated."""
     first, seeds = 0, list[IKSeeds]()
     for part in parts:
         seeds.append(dataclasses.replace(part.seeds, row=part.seeds.row + first))
@@ -50,9 +50,10 @@ def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
 
 
 def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable[..., None]) -> SeededContacts:
-    """Return closed contacts with seeds: at most `most` rows, far apart; in mode "paper" all, the most certain first.
+    """Return at most `most` closed contact sets, far apart, with initial hand postures (seeds).
 
-    `note` is called with the stages "plan", "certify" and "query".
+    In mode "paper" all sets are returned, the most certain first. `note` is called with the results of the stages
+    "plan", "certify" and "query".
     """
     request = problem.request
     note("plan", plan)
@@ -73,7 +74,7 @@ def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable
 
 @checked
 def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
-    """Return at most `most` successful rows, far apart, in plan order."""
+    """Return the indices of at most `most` successful contact sets that are far apart, in plan order."""
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
         return rows
@@ -82,7 +83,7 @@ def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
 
 
 def find_seeds(problem: Problem, contacts: Contacts) -> IKSeeds:
-    """Return postures near contacts: random postures in mode "joint", or configurations of the learned model."""
+    """Return initial hand postures near contacts: random ones in mode "joint", else from the learned model."""
     if problem.mixture is None:
         return nearest_postures(problem.library, contacts, problem.world, reachable=problem.reachable)
     if problem.request.mode == "paper":
@@ -91,18 +92,18 @@ def find_seeds(problem: Problem, contacts: Contacts) -> IKSeeds:
 
 
 class Pool:
-    """The contacts of all batches so far; each row is taken at most once."""
+    """The contact sets of all batches so far; each set is taken at most once."""
 
     def __init__(self) -> None:
         self.parts, self.costs, self.taken = list[SeededContacts](), list[Tensor](), list[Tensor]()
 
     def add(self, found: SeededContacts, cost: Float[Tensor, "n"]) -> None:
-        """Add contacts with the cost of each row, infinite for a row without seeds."""
+        """Add contact sets with their costs, infinite for a set without seeds."""
         self.parts.append(found)
         self.costs.append(cost)
 
     def take(self, most: int) -> SeededContacts:
-        """Return at most `most` of the cheapest rows, far from each other and from the rows taken before."""
+        """Return at most `most` of the cheapest contact sets, far from each other and from those taken before."""
         found = join_seeded(self.parts)
         points = sorted_points(found.contacts)
         before = torch.cat(self.taken) if self.taken else points.new_zeros(0, dtype=torch.long)
@@ -114,7 +115,7 @@ class Pool:
 
 
 def contact_costs(problem: Problem, found: SeededContacts) -> Float[Tensor, "b"]:
-    """Return the cost of each row: the log of the least residual of its two first seeds, and of the load's arm."""
+    """Return the cost of each contact set: log of its first two seeds' least residual, plus log of the load's arm."""
     contacts, certificate, seeds = found
     first = seeds[rank_in_group(seeds.row) < 2]
     residual = seed_costs(problem.reach(contacts, certificate), first)
@@ -124,6 +125,6 @@ def contact_costs(problem: Problem, found: SeededContacts) -> Float[Tensor, "b"]
 
 
 def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:
-    """Return the coordinates of each row's contacts, the lowest contact first."""
+    """Return the coordinates (3 f) of each contact set as one vector, the lowest contact first."""
     order = torch.argsort(contacts.points[..., 2], dim=1, stable=True)
     return contacts.points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)

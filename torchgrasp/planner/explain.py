@@ -27,7 +27,7 @@ MOST_TRIALS = 8  # most changes that are tried
 
 @dataclasses.dataclass(frozen=True)
 class Losses(Value):
-    """How many `things` a stage was given, and how many it lost for each reason, the most frequent first."""
+    """How many `things` (such as contacts) a stage was given, and how many it lost for each reason."""
 
     stage: str
     things: str
@@ -36,12 +36,12 @@ class Losses(Value):
 
     @property
     def kept(self) -> int:
-        """The number that the next stage gets."""
+        """The number that passes on to the next stage."""
         return self.given - sum(self.lost.values())
 
     @property
     def reasons(self) -> str:
-        """The reasons with their numbers."""
+        """The reasons with their counts, as text."""
         return ", ".join(f"{n} {status.name.lower()}" for status, n in self.lost.items())
 
     def __str__(self) -> str:
@@ -50,10 +50,11 @@ class Losses(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Funnel(Value):
-    """The losses of each stage, from random starts to executable grasps.
+    """The losses of each planning stage, from random initial guesses to executable grasps.
 
-    "contacts" are planned from starts. "postures" are lost where no posture is near the contacts; of the rest the most
-    promising are tried. "grasps" are executable; each failure counts once, by the check that its best posture fails.
+    Stage "contacts" counts contact sets planned from initial guesses. Stage "postures" loses contact sets without a
+    hand posture nearby; the most promising others are tried. Stage "grasps" counts executable grasps; each failure is
+    counted for the check that its best posture fails.
     """
 
     stages: tuple[Losses, ...]
@@ -61,7 +62,7 @@ class Funnel(Value):
     @classmethod
     @checked
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
-        """Return the funnel of the values of the stages "plan", "certify", "query" and "refine"."""
+        """Return the funnel from the observed values of the stages "plan", "certify", "query" and "refine"."""
         far = len(closed) - len(seeds.row.unique())
         stages = (
             Losses("contacts", "starts", len(plan), _failures(plan.status)),
@@ -77,18 +78,18 @@ class Funnel(Value):
 
     @property
     def worst(self) -> Losses:
-        """The first stage that lost everything, or else the stage that lost the greatest share."""
+        """The first stage that lost everything, or else the stage that lost the largest fraction."""
         empty = next((stage for stage in self.stages if stage.given and not stage.kept), None)
         return empty or max(self.stages, key=lambda stage: 1 - stage.kept / max(stage.given, 1))
 
     @property
     def reason(self) -> Status:
-        """The most frequent reason of the worst stage; `Status.OK` if nothing was lost."""
+        """The most frequent reason for losses in the worst stage; `Status.OK` if nothing was lost."""
         return next(iter(self.worst.lost), Status.OK)
 
     @checked
     def share(self, reasons: frozenset[Status]) -> float:
-        """Return the share lost for some reasons, summed over the stages."""
+        """Return the fraction lost for the given reasons, summed over the stages."""
         shares = (n / stage.given for stage in self.stages for status, n in stage.lost.items() if status in reasons)
         return sum(shares, 0.0)
 
@@ -97,15 +98,15 @@ class Funnel(Value):
 
 
 def _failures(status: Int[Tensor, "b"]) -> dict[Status, int]:
-    """Count the rows of each status but OK, the most frequent first."""
+    """Count each status other than OK, the most frequent first."""
     return {name: n for name, n in count_status(status).items() if name is not Status.OK}
 
 
 @dataclasses.dataclass(frozen=True)
 class Trial(Value):
-    """The result of one change: the number of executable grasps, and the `expected_success` of the best grasps.
+    """The result of planning with one change: the number of executable grasps, and their expected success.
 
-    A `choice` is up to the user; any other change is a fact of the world.
+    With `choice` the user can make the change; without, it is a fact about the world.
     """
 
     words: str
@@ -120,9 +121,10 @@ class Trial(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Explanation(Value):
-    """Where grasps were lost, and the results of single changes, the most helpful first; each had `starts` starts.
+    """Why there is no grasp: where grasps were lost, and the results of single changes, the most helpful first.
 
-    `str` gives a line for each stage, and a sentence about the best change.
+    Each change was planned from `starts` initial guesses. `str` gives one line for each stage, and a sentence about the
+    best change.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
     >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
@@ -142,7 +144,7 @@ class Explanation(Value):
 
     @property
     def advice(self) -> str:
-        """A sentence about the best change, and the best choice; or about the worst stage if no change helps."""
+        """A sentence about the best change and the user's best choice; if no change helps, about the worst stage."""
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
         tried = f"{len(self.trials)} change{'s' * (len(self.trials) != 1)} tried"
@@ -217,10 +219,10 @@ def explain_empty(
 
 
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
-    """Return the changes that could prevent many losses, the most helpful first.
+    """Return the changes that could prevent most losses, the most helpful first.
 
-    A change counts fully for the failures that it prevents, and one fifth for other failures at the same stage, because
-    a row names only one of the constraints that it fails.
+    A change counts fully for the failures that it prevents, and one fifth for other failures of the same stage, because
+    a failed contact set reports only one of its failures.
     """
     contacts = frozenset(status for status in Status if status < Status.OUT_OF_REACH)
     weight = dict[int, float]()
@@ -236,7 +238,7 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
 
 
 def try_request(request: Request) -> tuple[Funnel, float, ShapeGP]:
-    """Plan; return the funnel, the expected success and the estimated shape."""
+    """Plan a request; return the funnel, the expected success and the estimated shape."""
     told = dict[str, Any]()
     request = dataclasses.replace(request, observer=lambda stage, message, value: told.update({stage: value}))
     grasps = plan_grasps(**vars(request))

@@ -1,4 +1,4 @@
-"""From a partial point cloud, or an object of a scene, to ranked grasps: all at once, or batch by batch."""
+"""The planner's entry points: from a point cloud or a scene to ranked grasps, all at once or batch by batch."""
 
 import dataclasses
 import math
@@ -187,9 +187,10 @@ def _plan_batches(request: Request) -> Iterator[Grasps]:
 
 
 def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Grasps:
-    """Return the grasps of the set of fingers with the greatest `expected_success`.
+    """Return the grasps of the set of fingers whose expected success is greatest.
 
-    The sets share the time that is left. The observer hears "fingers" after each set, then the stages of the best set.
+    All sets share the remaining time. The observer is called with "fingers" after each set, then with the stages of the
+    best set.
     """
     best, observer = None, problem.request.observer
     for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
@@ -209,14 +210,15 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
 
 
 def expected_success(grasps: Grasps) -> float:
-    """Return the mean predicted success of the `BEST` likeliest grasps; missing grasps count as failures."""
+    """Return the mean predicted success of the `BEST` most probable grasps; missing grasps count as failures."""
     return float(grasps.success.sort(descending=True).values[:BEST].sum()) / BEST
 
 
 def _plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:
-    """Plan for each cloud, on its device; a bad cloud does not affect the others.
+    """Plan for each cloud on its device; a bad cloud does not affect the others.
 
-    A worker gives up a cloud after an hour. `given` are the other arguments of `Request`, for all clouds.
+    `given` holds the other arguments of `Request`, common to all clouds. A worker process gives up a cloud after an
+    hour.
     """
     for name in ("shape", "observer", "reachable"):
         if given.get(name) is not None:
@@ -241,7 +243,7 @@ def _plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]
 
 
 def _plan_or_refuse(request: Request) -> Grasps:
-    """Return the grasps of a request, or none with the reason."""
+    """Return the grasps of a request; if the cloud is bad, no grasps and the reason in `meta`."""
     try:
         return _plan(request)
     except MissingExtra:
@@ -251,12 +253,12 @@ def _plan_or_refuse(request: Request) -> Grasps:
 
 
 def _refused(hand: Hand, reason: str) -> Grasps:
-    """Return no grasps, with the reason in `meta`."""
+    """Return an empty set of grasps, with the reason in `meta`."""
     return dataclasses.replace(no_grasps(hand), meta={"hand": hand.name, "refused": reason})
 
 
 def no_grasps(hand: Hand) -> Grasps:
-    """Return no grasps of a hand."""
+    """Return an empty set of grasps of a hand."""
     f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:
@@ -271,14 +273,14 @@ def no_grasps(hand: Hand) -> Grasps:
 
 
 def _plan_to_file(cloud: Any, device: str, hand: HandSource, rest: dict[str, Any], file: Path) -> None:
-    """Plan in a worker, on a device."""
+    """Plan for one cloud in a worker process, and save the grasps to a file."""
     points = _with_tensors(cloud).to(torch.device(device))
     given = {name: _with_tensors(value) for name, value in rest.items()}
     _plan_or_refuse(Request(points, load_hand(hand.urdf_path.parent, hand.option), **given)).save(file)
 
 
 def _with_arrays(value: Any) -> Any:
-    """Return a value for another process: its class and fields, with arrays, because tensors would be shared."""
+    """Return a dataclass as its class and fields with NumPy arrays, because processes would share tensors."""
     if isinstance(value, torch.Tensor):
         return value.detach().cpu().numpy()
     if dataclasses.is_dataclass(value):
@@ -287,7 +289,7 @@ def _with_arrays(value: Any) -> Any:
 
 
 def _with_tensors(sent: Any) -> Any:
-    """Return a value that another process received from `_with_arrays`, with tensors again."""
+    """Return the value that `_with_arrays` packed, with tensors again."""
     if isinstance(sent, np.ndarray):
         return torch.from_numpy(sent)
     if isinstance(sent, tuple) and isinstance(sent[0], type):

@@ -1,4 +1,4 @@
-"""What grasps are planned from: the arguments of `plan_grasps`, and the planning problem in the upright frame."""
+"""The planning problem: the checked arguments of `plan_grasps`, and what is derived from them in the upright frame."""
 
 import dataclasses
 import hashlib
@@ -46,11 +46,11 @@ Observer = Callable[[str, str, Any], None]
 
 
 def ignore(stage: str, message: str, value: Any) -> None:
-    """Do nothing: the default observer."""
+    """Do nothing: the default observer of planning stages."""
 
 
 class PlanOptions(TypedDict, total=False):
-    """The further arguments of `plan_grasps`, which explains them.
+    """The optional keyword arguments of `plan_grasps`; see there.
 
     >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
     >>> sorted(options)
@@ -68,7 +68,7 @@ class PlanOptions(TypedDict, total=False):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """The arguments of `plan_grasps`, checked; `plan_grasps` explains them."""
+    """The checked arguments of `plan_grasps`; see there."""
 
     cloud: PointCloud | Scene
     hand: Hand
@@ -97,15 +97,16 @@ class Request:
 
     @property
     def hands(self) -> tuple[Hand, ...]:
-        """The hand with each set of fingers that may grasp."""
+        """One hand for each set of fingers that may grasp."""
         return finger_sets(self.hand, self.fingers, self.mode)
 
 
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
-    """Return the hand with each set of fingers: its own, another, or with "auto" all sets that the hand declares.
+    """Return one hand for each set of fingers to plan: its own, the named set, or with "auto" all declared sets.
 
     Raises:
-        BadArgument: fingers that the hand does not have, or more than three or "auto" in another mode than "joint".
+        BadArgument: fingers that the hand does not have; more than three fingers, or "auto", in a mode other than
+            "joint".
     """
     if fingers == "auto":
         if mode != "joint":
@@ -123,10 +124,10 @@ def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tu
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """Everything that grasps of one hand are planned from, in the upright frame of table and camera.
+    """The planning problem of one hand: object, shape, constraints and obstacles in the upright frame.
 
-    `request`, `cloud` (of the object) and `given_spec` are in the given frame, all else is in the upright frame. What
-    several stages need is built when it is first used.
+    The upright frame has the table's normal as z axis. `request`, the object's `cloud` and `given_spec` are in the
+    caller's frame, all other fields in the upright frame. Derived values are computed when first used.
     """
 
     request: Request
@@ -141,7 +142,7 @@ class Problem:
 
     @classmethod
     def of(cls, request: Request, hand: Hand) -> "Problem":
-        """Find the object, its upright frame and its shape."""
+        """Find the object, its upright frame and its shape; return the problem."""
         cloud, spec, scene = request.cloud, request.contact_spec, None
         if isinstance(cloud, Scene):
             scene, cloud = cloud, take_target(cloud, request.seed)
@@ -163,13 +164,13 @@ class Problem:
         return cls(request, settle(hand, shape.device), cloud, spec, frame, shape, scene, mixture, mixture_sha256)
 
     def for_hand(self, hand: Hand, observer: Observer) -> "Problem":
-        """Return the problem of another set of fingers, with another observer."""
+        """Return the problem for a hand with another set of fingers, and with another observer."""
         request = dataclasses.replace(self.request, observer=observer)
         return dataclasses.replace(self, request=request, hand=settle(hand, self.shape.device))
 
     @cached_property
     def flat(self) -> Settled:
-        """The constraints on the hand's contacts with the radius of flatness, and candidates of contacts."""
+        """The constraints on contacts with the radius of flatness, and the candidate contacts on flat surface."""
         spec = dataclasses.replace(self.given_spec, table=None if self.given_spec.table is None else 0.0)
         tips = self.hand.tips
         spec = dataclasses.replace(spec.for_fingertips(float(tips.radius.max())), fingertips=len(tips))
@@ -177,22 +178,22 @@ class Problem:
 
     @property
     def spec(self) -> ContactSpec:
-        """The constraints on the hand's contacts."""
+        """The constraints on contacts for this hand."""
         return self.flat.spec
 
     @cached_property
     def surface(self) -> Mesh:
-        """The estimated surface."""
+        """The estimated surface, as a mesh."""
         return extract_mesh(self.shape)
 
     @property
     def center(self) -> Float[Tensor, "3"]:
-        """The centre [m] of the estimated surface."""
+        """The centre [m] of the estimated surface: the mean of its vertices."""
         return self.surface.vertices.mean(0)
 
     @cached_property
     def obstacles(self) -> Obstacles | None:
-        """The obstacles of a scene."""
+        """The obstacles around the target of a scene; None without a scene."""
         scene = self.scene
         if scene is None or scene.target is None:
             return None
@@ -200,7 +201,7 @@ class Problem:
 
     @cached_property
     def world(self) -> CollisionWorld:
-        """The object, table and obstacles that links must not touch. Thick solid objects have a coarser field."""
+        """The object, table and obstacles that the hand's links must not touch, as distance fields."""
         vertices, faces = self.surface.vertices, self.surface.faces
         thick = float((vertices.amax(0) - vertices.amin(0)).min()) > 0.04 and len(walls_of(self.shape)) == 1
         field = field_from_surface(vertices, faces, spacing=0.004 if thick else 0.003)
@@ -208,12 +209,12 @@ class Problem:
 
     @cached_property
     def library(self) -> PostureLibrary:
-        """Random postures of the hand."""
+        """The library of random postures of the hand."""
         return PostureLibrary.of(self.hand, seed=self.request.seed)
 
     @cached_property
     def buried(self) -> bool:
-        """Whether the lifted surface runs into obstacles more than 3 mm deeper than the standing surface."""
+        """Whether the object cannot be lifted free: rising, it runs into obstacles, over 3 mm deeper than at rest."""
         if self.obstacles is None or not self.obstacles.hard:
             return False
         standing = float(self.obstacles.field.query(self.surface.vertices)[0].min())
@@ -221,21 +222,21 @@ class Problem:
 
     @cached_property
     def reachable(self) -> Reachable | None:
-        """The user's predicate of reachable poses, for poses in the upright frame."""
+        """The user's function that says which hand poses an arm reaches, converted to the upright frame."""
         given, frame = self.request.reachable, self.obj_from_upright
         return None if given is None else lambda poses: given(frame.to(poses) @ poses)
 
     def reach(self, contacts: Contacts, certificate: Certificate) -> GraspProblem:
-        """Return the inverse kinematics of certified contacts."""
+        """Return the inverse kinematics problem for certified contacts."""
         return GraspProblem(self.hand, contacts, certificate, self.world, self.center, self.reachable)
 
     def tell(self, stage: str, message: str, value: Any) -> None:
-        """Report a stage to the observer, in the given frame."""
+        """Report a stage to the observer, with its value in the caller's frame."""
         if self.request.observer is not ignore:
             self.request.observer(stage, message, self._moved(value))
 
     def give_back(self, grasps: Grasps) -> Grasps:
-        """Return grasps in the given frame, with their origin and units as metadata."""
+        """Return grasps in the caller's frame, with frames, units and provenance as metadata."""
         hand, spec, request = self.hand, self.given_spec, self.request
         meta = {
             "hand": hand.name,
@@ -256,14 +257,14 @@ class Problem:
         return dataclasses.replace(self._moved(grasps), meta=grasps.meta | meta)
 
     def _moved(self, value: Any) -> Any:
-        """Return a value in the given frame."""
+        """Return a value, converted to the caller's frame."""
         frame = self.obj_from_upright
         return value.moved(frame) if isinstance(value, ShapeGP) else move(value, frame)
 
 
 @checked
 def take_target(scene: Scene, seed: Seed) -> PointCloud:
-    """Return the cloud of a scene's target, at most `TARGET_POINTS` random points of it.
+    """Return the point cloud of a scene's target: at most `TARGET_POINTS` random points.
 
     Raises:
         BadArgument: the scene has no target, or no object has the target's label.
@@ -277,5 +278,5 @@ def take_target(scene: Scene, seed: Seed) -> PointCloud:
 
 
 def digest(cloud: PointCloud) -> str:
-    """Return the SHA-256 of a cloud's points, by which results name their input."""
+    """Return the SHA-256 of a cloud's points; grasps store it as the identity of their input."""
     return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""The objects of a scene, ranked by their best grasps; an object without a grasp has a reason."""
+"""Planning for all objects of a scene: the objects are ranked by their best grasps."""
 
 import dataclasses
 import functools
@@ -27,7 +27,7 @@ from torchgrasp.values import Grasps
 @checked
 @dataclasses.dataclass(frozen=True)
 class ThingPlan(Value):
-    """The executable grasps of one object, best first, or the reason why there are none.
+    """The executable grasps of one object in a scene, best first, or the reason why there are none.
 
     `success` is predicted for the best grasp; without grasps it is 0. `shape` is the estimated shape.
 
@@ -47,7 +47,7 @@ class ThingPlan(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ScenePlan(Value):
-    """The objects of a scene, the likeliest success first; then objects without a grasp, and objects not tried.
+    """The plans of all objects in a scene, most probable success first; objects without a grasp come last.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None
@@ -83,7 +83,7 @@ def plan_scene(
         scene: objects on a table.
         hand: from `load_hand`.
         spec: the constraints on contacts; None: `ContactSpec()`.
-        starts: random starts of the contact planner for each object.
+        starts: random initial guesses of the contact planner for each object.
         seed: random seed.
         fingers: see `plan_grasps`; "auto" chooses fingers for each object. `hand_of` loads the hand of grasps.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.
@@ -113,7 +113,7 @@ def plan_scene(
 
 
 def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
-    """Plan grasps of a scene's target."""
+    """Plan grasps of a scene's target object."""
     assert scene.target is not None
     stages: dict[str, Any] = {}
 
