@@ -92,8 +92,6 @@ def field_from_surface(
         BadArgument: wrong shapes, faces that name no vertex or have no area, or a grid of more than 2e7 nodes.
     """
     check_tensor("vertices", vertices, (None, 3))
-    if not 1e-4 <= spacing <= 0.1 or not 0 <= margin <= 1:
-        raise BadArgument("spacing, margin", (spacing, margin), "spacing in [1e-4, 0.1], margin in [0, 1]")
     surface = _Surface(vertices, faces)
     low, high = vertices.amin(0).double() - margin, vertices.amax(0).double() + margin
     # the first nodes are every fourth of the finest

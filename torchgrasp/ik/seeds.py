@@ -218,8 +218,6 @@ def query_mixture(
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
-    if not max_energy > 0:
-        raise BadArgument("max_energy", max_energy, "a positive number")
     hand, mixture = settle(hand, contacts.points.device), settle(mixture, contacts.points.device)
     firsts = range(0, max(len(contacts), 1), 256)  # their configurations stay in the cache
     parts = [_query(hand, contacts[k : k + 256], mixture, n_seeds, max_energy) for k in firsts]
