@@ -276,6 +276,19 @@ def test_scene_is_that_of_the_depth_image(tmp_path, capsys):
     assert "--mask" in capsys.readouterr().err
 
 
+def test_scene_draws_a_picture_beside_it_that_replaces_no_input(tmp_path, capsys):
+    depth = np.full((120, 160), 0.8, dtype=np.float32)
+    depth[40:80, 60:100] = 0.7
+    Image.fromarray(np.uint16(1e3 * depth)).save(tmp_path / "depth.png")
+    words = ["cloud", "scene", str(tmp_path / "depth.png"), "--intrinsics", "140", "140", "79.5", "59.5", "--out"]
+    assert cli.main([*words, str(tmp_path / "depth.npz")]) == 2
+    assert "replace" in capsys.readouterr().err and not (tmp_path / "depth.npz").exists()
+    assert cli.main([*words, str(tmp_path / "scene.npz")]) == 0
+    assert str(tmp_path / "scene.png") in capsys.readouterr().out
+    with Image.open(tmp_path / "scene.png") as picture:
+        assert picture.width == 1200
+
+
 def test_thin_leaves_one_point_a_voxel_and_no_outliers(tmp_path, capsys):
     rng = np.random.default_rng(0).normal(size=(60000, 3))
     points = np.concatenate([0.04 * rng / np.linalg.norm(rng, axis=1, keepdims=True), [[0.3, 0, 0]]])

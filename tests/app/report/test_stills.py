@@ -17,7 +17,6 @@ from torchgrasp.app.report.stills import (
     draw_among,
     draw_cloud,
     draw_contacts,
-    draw_depth,
     draw_grasp,
     draw_surface,
     facing,
@@ -61,17 +60,6 @@ def test_pictures_are_reproducible(run):
 @pytest.fixture(scope="module")
 def scene():
     return load_scene().select(4)
-
-
-def test_the_target_has_its_colour_and_missing_pixels_are_white(scene):
-    pixels = decode(draw_depth(scene))
-    row, column = scene.pixels[scene.rows_of()].T.numpy()
-    target = pixels[row, column]
-    hue = target / target.max(1, keepdims=True)
-    assert np.abs(hue - np.array(rgb(OBJECTS[3])) / max(rgb(OBJECTS[3]))).max() < 0.02
-    assert (pixels[scene.image.depth.numpy() == 0] == 1).all()
-    other = scene.pixels[scene.rows_of(1)].T.numpy()
-    assert pixels[other[0], other[1]].min() > target.min()  # the others are pale
 
 
 def test_neighbours_are_drawn_and_the_target_is_not_drawn_twice(run, scene):

@@ -15,6 +15,7 @@ from torchgrasp.app.cli.inputs import (
     find_cloud,
     print_notes,
 )
+from torchgrasp.app.report.scene import draw_scene
 from torchgrasp.checks import Range, Seed, check_tensor
 from torchgrasp.cloud import (
     cloud_from_depth,
@@ -155,19 +156,23 @@ class CloudDepth(_DepthCommand):
 
 @arguments()
 class CloudScene(_DepthCommand):
-    """Write the scene of a depth image for `torchgrasp grasp`: the table and the objects on it."""
+    """Write the scene of a depth image for `torchgrasp grasp`: the table and the objects on it; and its picture."""
 
-    out: Path = required("scene to write (.npz)")
+    out: Path = required("scene to write (.npz); beside it a .png shows the table, objects and obstacles")
 
     def run(self) -> int:
         """Write the scene."""
+        picture = self.out.with_suffix(".png")
+        if picture.resolve() in [path.resolve() for path in (self.depth, self.mask) if path is not None]:
+            raise BadArgument("--out", f"{self.out}, whose picture would replace {picture}", "another name")
         depth, mask, pose = self.images()
         seen = Scene.from_depth(depth, self.intrinsics, pose, mask=mask)
         save_scene(seen, self.out)
+        draw_scene(seen, picture)
         for label in seen.things:
             print(f"object {label}: {int(seen.rows_of(label).sum())} points{' (the target)' * (label == seen.target)}")
         table = "unknown" if seen.table is None else seen.table.describe()
-        print("\n".join([f"table: {table}", *(f"advice: {sentence}" for sentence in seen.advice), str(self.out)]))
+        print("\n".join([f"table: {table}", *(f"advice: {sentence}" for sentence in seen.advice), f"{self.out}, {picture}"]))
         return 0
 
 

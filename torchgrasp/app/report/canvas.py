@@ -15,6 +15,8 @@ AXES = ("#d62728", "#2ca02c", "#1f4fd8")
 """Colours of x, y and z of a frame."""
 HAND, OBJECT, TABLE = "#a9b0ba", "#e9d7b3", "#eceae4"
 """Colours of the palm with parked fingers, of the object, and of the table."""
+OBJECTS = ("#e8743b", "#3f83d9", "#57a84f", "#b65fae", "#e0b92f", "#35aaa3", "#dd6b78", "#8474c9")
+"""Colours of the objects of a scene in the order of their labels, again from the first."""
 PAPER, INK, GRID, ALARM = "#fcfcfa", "#22262b", "#dcdad3", "#c2452d"
 """Colours of the background, of lines with text, of grid lines, and of the moment at which an object was lost."""
 SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a page of three columns

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 from torchgrasp.app.report.canvas import FINGERS
 from torchgrasp.app.report.film import describe_film, draw_film
 from torchgrasp.app.report.run import Run, verdict
+from torchgrasp.app.report.scene import encode_scene
 from torchgrasp.app.report.stills import (
     draw_among,
     draw_cloud,
     draw_contacts,
-    draw_depth,
     draw_grasp,
     draw_surface,
     facing,
@@ -76,7 +76,7 @@ def draw_pictures(run: Run) -> Sections:
         ]
     }
     if run.scene is not None:
-        seen = [("The depth image: the target in full colour, the other objects pale.", draw_depth(run.scene))]
+        seen = [("What was found in the depth image; the target has a white rim.", encode_scene(run.scene))]
         if len(best):
             among = draw_among(run.scene, run.surface, run.hand, best[0], view)
             seen.append(("The best grasp among the measured points of the other objects.", among))

@@ -14,6 +14,7 @@ from torchgrasp.app.report.canvas import (
     HAND,
     INK,
     OBJECT,
+    OBJECTS,
     PAPER,
     TABLE,
     Canvas,
@@ -28,10 +29,6 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values import Contacts, Grasps, PointCloud
-
-OBJECTS = ("#d98f5c", "#6f9fd8", "#7fb77e", "#c77cba", "#d8c25a", "#6bbdb7", "#e08a8a", "#9a8fd1")
-"""Colours of the objects of a scene in the order of their labels, again from the first."""
-
 
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
     """Draw a cloud from its camera, coloured by height."""
@@ -81,23 +78,6 @@ def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direct
         canvas.add_points(_thinned(points, 4000), _label_colors(_thinned(labels, 4000)))
     canvas.add_table(corners, None if scene.table is None else 0.0)
     return canvas.render_png(corners, direction)
-
-
-def draw_depth(scene: Scene) -> bytes:
-    """Draw the depth image with a colour for each object; the target is bright, and unmeasured pixels are white."""
-    from PIL import Image
-
-    depth, labels = to_array(scene.image.depth), np.zeros(scene.image.depth.shape, dtype=int)
-    row, column = scene.pixels.cpu().numpy().T
-    labels[row, column] = scene.labels.cpu().numpy()
-    seen = depth > 0
-    near, far = np.quantile(depth[seen], [0.01, 0.99])
-    light = 1.0 - 0.6 * np.clip((depth - near) / max(far - near, 1e-6), 0.0, 1.0)
-    pixels = light[..., None] * _label_colors(labels)
-    if scene.target is not None:
-        pixels = np.where((labels != scene.target)[..., None], 0.4 * pixels + 0.55, pixels)
-    pixels[~seen] = 1.0
-    return encode_png(Image.fromarray(np.uint8(255 * np.clip(pixels, 0.0, 1.0))))
 
 
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
