@@ -15,7 +15,12 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene import Scene
 
 SHAPE = (120, 160)
-PARTS = {"box": np.s_[40:80, 30:70], "wall": np.s_[:, 140:], "hole": np.s_[90:110, 20:60], "floor": np.s_[90:110, 90:130]}
+PARTS = {
+    "box": np.s_[40:80, 30:70],
+    "wall": np.s_[:, 140:],
+    "hole": np.s_[90:110, 20:60],
+    "floor": np.s_[90:110, 90:130],
+}
 
 
 def paint(values: dict[str, float], rest: float) -> np.ndarray:

@@ -172,7 +172,11 @@ class CloudScene(_DepthCommand):
         for label in seen.things:
             print(f"object {label}: {int(seen.rows_of(label).sum())} points{' (the target)' * (label == seen.target)}")
         table = "unknown" if seen.table is None else seen.table.describe()
-        print("\n".join([f"table: {table}", *(f"advice: {sentence}" for sentence in seen.advice), f"{self.out}, {picture}"]))
+        print(
+            "\n".join(
+                [f"table: {table}", *(f"advice: {sentence}" for sentence in seen.advice), f"{self.out}, {picture}"]
+            )
+        )
         return 0
 
 

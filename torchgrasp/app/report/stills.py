@@ -30,6 +30,7 @@ from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values import Contacts, Grasps, PointCloud
 
+
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
     """Draw a cloud from its camera, coloured by height."""
     points = _thinned(to_array(cloud.points), 3000)
