@@ -4,6 +4,7 @@ import trimesh
 
 from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.cloud.support import Support
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.segment import on_surface, segment
@@ -38,7 +39,7 @@ def look(meshes, elevation=40.0, noise=True):
 )
 def test_each_thing_has_one_label(meshes, elevation):
     image, labels = look(meshes, elevation)
-    found = segment(image, TABLE)
+    found = segment(image, Support(TABLE))
     assert found.max() == len(meshes)
     for k in range(1, len(meshes) + 1):
         mine = (labels == k) & (image.depth > 0)
@@ -49,7 +50,7 @@ def test_each_thing_has_one_label(meshes, elevation):
 
 def test_an_empty_table_has_no_things():
     image, _ = look([box([0.01, 0.01, 0.01], [0.0, 0.0, -0.1])])
-    assert not segment(image, TABLE).any()
+    assert not segment(image, Support(TABLE)).any()
 
 
 def test_flying_pixels_belong_to_nothing():
@@ -62,7 +63,7 @@ def test_flying_pixels_belong_to_nothing():
     flying[row - 2 : row, column - 20 : column + 20] = image.depth[row + 3, column] + away
     moved = DepthImage(flying, image.intrinsics, image.obj_from_camera)
     assert not on_surface(moved, TABLE)[row - 2 : row, column - 20 : column + 20].any()
-    assert segment(moved, TABLE).max() == 1
+    assert segment(moved, Support(TABLE)).max() == 1
 
 
 def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
@@ -71,5 +72,5 @@ def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
     pan, labels = look([trimesh.util.concatenate([rim, floor])], 60.0)
     ring, _ = look([rim], 60.0)
     inside = (pan.points()[..., :2].norm(dim=-1) < 0.07) & (labels == 1)
-    assert (segment(pan, TABLE)[inside & (pan.depth > 0)] == 1).double().mean() > 0.95
-    assert (segment(ring, TABLE)[inside & (ring.depth > 0)] == 0).double().mean() > 0.95
+    assert (segment(pan, Support(TABLE))[inside & (pan.depth > 0)] == 1).double().mean() > 0.95
+    assert (segment(ring, Support(TABLE))[inside & (ring.depth > 0)] == 0).double().mean() > 0.95

@@ -139,7 +139,16 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     Raises:
         CloudFileError: no such file, or malformed content.
     """
-    names = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table", "target")  # the first two are required
+    names = (
+        "depth",
+        "intrinsics",
+        "camera_pose",
+        "labels",
+        "mask",
+        "table",
+        "others",
+        "target",
+    )  # the first two are required
     allowed = "a .npz file with depth and intrinsics"
     if path.suffix.lower() != ".npz" or not is_file(path):
         raise CloudFileError("path", path, allowed)
@@ -150,6 +159,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         found = {name: arrays[name] for name in ("depth", "intrinsics")} | arrays
         if "table" in found:
             found["table"] = found["table"].astype(float).reshape(4)
+        if "others" in found:
+            found["others"] = found["others"].astype(float).reshape(-1, 4)
         if "target" in found:
             found["target"] = found["target"].astype(np.int64, casting="safe").reshape(())
     except BadArgument:

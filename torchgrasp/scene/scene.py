@@ -13,12 +13,12 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, checked
 from torchgrasp.cloud.depth import read_depth
+from torchgrasp.cloud.support import find_table
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import write_file
 from torchgrasp.geometry.plane import Plane, to_upright
 from torchgrasp.scene.image import DepthImage, image_of_cloud, read_arrays, read_image, read_labels
 from torchgrasp.scene.segment import label_image
-from torchgrasp.scene.support import find_table
 from torchgrasp.values import PointCloud
 
 
@@ -34,6 +34,7 @@ class Scene(Value):
         pixels: row and column of each point in the image.
         table: the plane that the objects stand on; None: unknown.
         target: label of the object to be grasped; None: not chosen.
+        others: other planes that objects could stand on, the more plausible first.
 
     >>> from torchgrasp import load_scene
     >>> target = load_scene().select([394, 312])  # a clicked pixel: column, row
@@ -47,6 +48,7 @@ class Scene(Value):
     pixels: Int[Tensor, "n 2"]
     table: Plane | None = None
     target: int | None = None
+    others: tuple[Plane, ...] = ()
 
     @classmethod
     @checked
@@ -89,10 +91,11 @@ class Scene(Value):
         inside = None if inside is None else inside.cpu()
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points, measured = image.points(), image.depth > 0
-        plane = find_table(points[measured], image.obj_from_camera[:3, 3], table, up)
-        found = label_image(image, plane, given, inside)
+        supports = find_table(points[measured], image.obj_from_camera[:3, 3], table, up)
+        found = label_image(image, supports[0], given, inside)
         target = None if mask is None else 1
-        scene = cls(points[measured], found[measured], image, torch.nonzero(measured), plane, target)
+        planes = tuple(support.plane for support in supports)
+        scene = cls(points[measured], found[measured], image, torch.nonzero(measured), planes[0], target, planes[1:])
         return scene if point is None else scene.select(point)
 
     @classmethod
@@ -142,8 +145,9 @@ class Scene(Value):
             inside = ((points >= corners.amin(0)) & (points <= corners.amax(0))).all(-1)
         if inside is not None and not bool(inside.any()):
             raise BadArgument("mask" if box is None else "box", "no point inside", "one that holds the target")
-        plane = find_table(points, viewpoint, table, up)
-        image, pixels = image_of_cloud(points, viewpoint, plane.normal.double())
+        supports = find_table(points, viewpoint, table, up)
+        planes = tuple(support.plane for support in supports)
+        image, pixels = image_of_cloud(points, viewpoint, planes[0].normal.double())
         row, column = pixels.unbind(-1)
         depth = ((points - viewpoint) @ image.obj_from_camera[:3, 2]) - image.depth[row, column]
         front = depth < 0.01  # [m]; other points belong to something hidden behind the pixel
@@ -155,9 +159,9 @@ class Scene(Value):
             whole[row[front], column[front]] = values[front]
             return whole
 
-        found = label_image(image, plane, to_image(given), to_image(inside))
+        found = label_image(image, supports[0], to_image(given), to_image(inside))
         own = torch.where(front, found[row, column], 0)
-        scene = cls(points, own, image, pixels, plane, None if inside is None else 1)
+        scene = cls(points, own, image, pixels, planes[0], None if inside is None else 1, planes[1:])
         return scene if point is None else scene.select(point)
 
     @checked
@@ -203,6 +207,11 @@ class Scene(Value):
         return ("the target is cut off at the border of the image: its other part is unknown; turn the camera to it",)
 
     @property
+    def supports(self) -> tuple[Plane, ...]:
+        """The planes that objects could stand on, the table first."""
+        return () if self.table is None else (self.table, *self.others)
+
+    @property
     def viewpoint(self) -> Float[Tensor, "3"]:
         """The camera's position [m]."""
         return self.image.obj_from_camera[:3, 3]
@@ -242,6 +251,7 @@ class Scene(Value):
             points=to_upright(self.points, obj_from_upright),
             image=self.image.to_upright(obj_from_upright),
             table=None if self.table is None else Plane.horizontal(0.0),
+            others=(),
         )
 
 
@@ -263,8 +273,12 @@ def read_scene(path: Path | str) -> Scene:
     """
     arrays = read_arrays(Path(path))
     table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
-    plane = None if table is None else Plane(torch.tensor(table[:3]), float(table[3]))
+    others = arrays.pop("others", np.empty((0, 4)))
+    plane, *rest = (
+        (Plane(torch.tensor(row[:3]), float(row[3])) for row in [table, *others]) if table is not None else [None]
+    )
     scene = Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
+    scene = dataclasses.replace(scene, others=tuple(rest)) if rest else scene
     return scene if target is None else scene.select(int(target))
 
 
@@ -294,6 +308,8 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
     }
     if scene.table is not None:
         arrays["table"] = np.array([*scene.table.normal.tolist(), scene.table.offset])
+    if scene.others:
+        arrays["others"] = np.array([[*plane.normal.tolist(), plane.offset] for plane in scene.others])
     if scene.target is not None:
         arrays["target"] = np.array(scene.target)
     np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.cloud.support import Support
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
@@ -21,10 +22,11 @@ NEAR = 0.005  # distance [m] within which a pixel at a depth jump belongs to an 
 FEW = 6  # pieces with fewer pixels are noise
 GAP, TOUCH, FLOATING_GAP = 0.008, 3, 0.013
 """Pieces touch where TOUCH pixels are within GAP [m]; a floating piece belongs to one within FLOATING_GAP [m]."""
+OVERHANG = 0.05  # distance [m] to which an object extends beyond the visible region of its support
 MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a box drawn around an object are
 
 
-def segment(image: DepthImage, table: Plane) -> Int[Tensor, "h w"]:
+def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     """Return the label of each pixel: 0 for the table, flying pixels and nothing; 1, 2, ... for objects by size.
 
     An object is a connected component of the pixels above the table, in which depth has no jump. Pixels at jumps go to
@@ -32,22 +34,25 @@ def segment(image: DepthImage, table: Plane) -> Int[Tensor, "h w"]:
 
     Args:
         image: one view of the scene.
-        table: the plane that the objects stand on, in the frame of the image.
+        support: the plane that the objects stand on, in the frame of the image, and its region. A wall, or a chair
+            behind the table, is beside the region: it is no object.
     """
+    table, points = support.plane, image.points()
     measured, smooth = image.depth > 0, image.without_speckle()
     mean, threshold = _smoothed(image, table)
-    risen = _risen(smooth, table, mean, threshold)
+    risen = _risen(smooth, table, mean, threshold) & support.covers(points, OVERHANG)
     core, jump = _core(smooth, risen)
-    pieces = _grown(image.points(), _components(core, smooth.depth, jump), risen)
+    pieces = _grown(points, _components(core, smooth.depth, jump), risen)
     thin = _components(risen & (pieces == 0), smooth.depth, jump)
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
     # A tenth of an object's pixels are 3.5 mm high; an uneven table is not.
     high = _counts(torch.where(mean > 0.0035, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
     few = _counts(torch.where(sure, pieces, 0), len(high)) < FEW
-    pieces = torch.where((few | ~high)[pieces], 0, pieces)
+    beside = _counts(torch.where(support.covers(points), pieces, 0), len(high)) < 0.2 * _counts(pieces)
+    pieces = torch.where((few | ~high | beside)[pieces], 0, pieces)
     group = _merge(smooth, torch.where(sure, pieces, 0), table, jump)
-    return _numbered(_filled(group[pieces], measured, table.height(image.points())))
+    return _numbered(_filled(group[pieces], measured, table.height(points)))
 
 
 def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
@@ -58,7 +63,7 @@ def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
 
 
 def label_image(
-    image: DepthImage, table: Plane, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
+    image: DepthImage, support: Support, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> Int[Tensor, "h w"]:
     """Return the label of each pixel: the given ones without table and flying pixels, or those of `segment`.
 
@@ -69,14 +74,14 @@ def label_image(
         BadArgument: nothing but the table is left of a mask, or nothing of all labels.
     """
     if labels is not None:
-        kept = torch.where(on_surface(image, table), labels, 0)
+        kept = torch.where(on_surface(image, support.plane), labels, 0)
         if not bool((kept > 0).any()):
             raise BadArgument("labels", "none that rises above the table", "labels of objects on the table")
         return kept
-    objects = segment(image, table)
+    objects = segment(image, support)
     if mask is None:
         return objects
-    inside = mask & on_surface(image, table)
+    inside = mask & on_surface(image, support.plane)
     pieces, length = torch.where(inside, objects, 0), int(objects.max()) + 1
     whole, part = _counts(objects, length), _counts(pieces, length)
     belongs = (part >= 0.5 * whole) | (part >= 0.3 * max(1, int(inside.sum())))

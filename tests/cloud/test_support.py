@@ -6,10 +6,10 @@ import trimesh
 
 from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
-from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.support import find_supports, fit_support
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
-from torchgrasp.scene.support import fit_support
+from torchgrasp.scene.image import read_image
 
 POSE = look_at(30.0, 40.0, 0.6)
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -25,8 +25,8 @@ def look(meshes, table=0.0, pose=POSE):
     depth, _ = render_depth(meshes, pose, table=table)
     kept = torch.zeros_like(depth)
     kept[::3, ::3] = depth[::3, ::3]
-    cloud = cloud_from_depth(kept, INTRINSICS, camera_pose=pose)
-    return cloud.points, cloud.viewpoint
+    image = read_image(kept, INTRINSICS, pose)
+    return image.points()[kept > 0], pose[:3, 3]
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +63,13 @@ def test_gravity_is_used_and_must_agree(seen):
         fit_support(*seen, -UP)
 
 
-def test_a_wall_with_things_on_both_sides_is_no_table():
-    wall = [box([0.001, 0.2, 0.2], [0.0, 0.0, 0.0]), box([0.2, 0.4, 0.1], [-0.2, 0.0, 0.0])]
+def test_a_plane_through_which_things_are_seen_is_no_table():
+    frame = [box([0.15, 0.6, 0.01], [x, 0.0, -0.005]) for x in (-0.225, 0.225)]
+    frame += [box([0.6, 0.15, 0.01], [0.0, y, -0.005]) for y in (-0.225, 0.225)]
+    below = box([0.4, 0.4, 0.1], [0.0, 0.0, -0.2])
+    cup = box([0.05, 0.05, 0.05], [0.2, 0.0, 0.025])
     with pytest.raises(NoSupport):
-        fit_support(*look([*THINGS, *wall], table=None))
+        fit_support(*look([*frame, below, cup], table=None))
 
 
 @pytest.mark.parametrize("size", [[0.2, 0.15, 0.1], [0.16, 0.08, 0.008], [0.3, 0.3, 0.02]])
@@ -80,11 +83,28 @@ def test_things_that_float_have_no_table():
         fit_support(*look(THINGS, table=None))
 
 
-def test_a_table_before_a_wall_is_refused_without_gravity():
+def test_a_table_before_a_wall_needs_no_gravity():
     seen = look([*THINGS, box([0.01, 2.0, 2.0], [-0.35, 0.0, 0.5])], pose=look_at(0.0, 35.0, 0.7))
-    assert fit_support(*seen, UP).normal[2] > 0.9999
-    with pytest.raises(NoSupport, match="two planes"):
-        fit_support(*seen)
+    for up in (UP, None):
+        assert fit_support(*seen, up).normal[2] > 0.9999
+
+
+def test_the_table_comes_before_the_floor_that_carries_more():
+    top, floor = box([0.5, 0.4, 0.02], [0.0, 0.0, -0.01]), box([4.0, 4.0, 0.01], [0.0, 0.0, -0.455])
+    boxes = [box([0.2, 0.2, 0.2], [x, y, -0.35]) for x in (0.5, -0.6) for y in (-0.5, 0.5)]
+    cup = box([0.06, 0.06, 0.08], [0.0, 0.0, 0.04])
+    pose = look_at(0.0, 35.0, 1.0)
+    first, second = find_supports(*look([top, floor, *boxes, cup], table=None, pose=pose))[:2]
+    assert abs(first.plane.offset) < 0.003 and abs(second.plane.offset + 0.45) < 0.01
+    assert bool(first.covers(torch.tensor([0.2, 0.1, 0.3]))) and not bool(first.covers(torch.tensor([0.3, 0.1, 0.3])))
+
+
+def test_the_floor_of_a_bin_is_the_support():
+    walls = [box([0.02, 0.5, 0.25], [x, 0.0, 0.125]) for x in (-0.2, 0.2)]
+    walls += [box([0.4, 0.02, 0.25], [0.0, y, 0.125]) for y in (-0.25, 0.25)]
+    toy = box([0.05, 0.08, 0.04], [0.03, 0.05, 0.02])
+    plane = fit_support(*look([*walls, toy], pose=look_at(20.0, 80.0, 0.7)))
+    assert plane.normal[2] > 0.999 and abs(plane.offset) < 0.002
 
 
 def test_a_floor_deep_below_is_no_objection():

@@ -1,0 +1,123 @@
+"""Planes through many points of a view, one after the other: proposed by triples, refined by robust least squares."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+NOISE, NOISE_GROWTH = 0.001, 0.0035
+"""Assumed noise [m] of a depth camera, and its growth with the squared distance [1/m]."""
+ROUGH = 1.4  # a greater scale of the residuals, over the assumed noise, belongs to no flat plane
+LEAST_SHARE = 0.05  # least share of the points on a plane
+REACH = 0.30  # height [m] of objects above a plane
+MOST_TILT = 30.0  # greatest angle [deg] between the normal and `up`
+
+
+def assume_noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -> Float[Tensor, "n"]:
+    """Return the assumed noise [m] of each point; without a camera that of 0.7 m distance."""
+    squared = torch.full((len(points),), 0.7**2, dtype=points.dtype)
+    return NOISE + NOISE_GROWTH * (squared if eye is None else (points - eye).square().sum(-1))
+
+
+class View:
+    """Points [m] about their centre, the camera, the direction against gravity, and the noise."""
+
+    def __init__(
+        self, points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None, sky: Float[Tensor, "3"] | None
+    ) -> None:
+        self.points, self.eye, self.sky = points, eye, sky
+        self.noise = assume_noise(points, eye)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaneFit:
+    """A plane normal . p = offset, the scale of the noise about it, and the number of points on it."""
+
+    normal: Float[Tensor, "3"]
+    offset: float
+    scale: float
+    count: int
+
+    def turned_up(self, view: "View") -> "PlaneFit":
+        """Return the plane with its normal along `up`, else towards the camera, else to the side with more points."""
+        if view.sky is not None:
+            side = float(self.normal @ view.sky)
+        elif view.eye is not None:
+            side = float(self.normal @ view.eye) - self.offset
+        else:
+            side = float((view.points @ self.normal - self.offset).clamp(-REACH, REACH).sum())
+        return self if side >= 0 else dataclasses.replace(self, normal=-self.normal, offset=-self.offset)
+
+
+def fit_planes(view: View, generator: torch.Generator) -> Iterator[PlaneFit]:
+    """Yield planes through many points, one after the other."""
+    scored = 2000  # points that score the proposals
+    points, noise = view.points[:scored], view.noise[:scored]
+    normals, offsets = _propose(view, scored, generator)
+    held = _held(points, noise, normals, offsets)
+    for _ in range(8):
+        counts = held.sum(-1)
+        i = int(counts.argmax()) if len(counts) else 0
+        if not len(counts) or int(counts[i]) < 0.5 * LEAST_SHARE * len(points):
+            break
+        fit = _refine(view, normals[i], float(offsets[i]))
+        yield fit
+        held = held & ((points @ fit.normal - fit.offset).abs() > 3 * noise) & ~held[i]
+
+
+def _propose(view: View, scored: int, generator: torch.Generator) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
+    """Return unit normals and offsets of planes through triples of points, far apart and close together."""
+    from scipy.spatial import KDTree
+
+    points = view.points
+    some = points[:scored]
+    near = torch.from_numpy(KDTree(some.numpy()).query(some.numpy(), min(60, len(some)))[1])
+    pick = torch.randint(near.shape[1], (2, len(some), 1), generator=generator)
+    far = points[torch.randint(len(points), (3, 4000), generator=generator)]
+    a, b, c = torch.cat([far, torch.stack([some, *(some[near.gather(1, k)[:, 0]] for k in pick)])], 1)
+    normal = torch.linalg.cross(b - a, c - a)
+    double_area = torch.linalg.vector_norm(normal, dim=-1)
+    longest = torch.stack([(b - a).norm(dim=-1), (c - a).norm(dim=-1), (c - b).norm(dim=-1)]).amax(0)
+    wide = double_area / longest.clamp_min(1e-12) > 10 * view.noise.median()  # a lower triangle's normal is noise
+    normal = normal[wide] / double_area[wide, None]
+    offset = (normal * a[wide]).sum(-1)
+    if view.sky is not None:
+        upright = (normal @ view.sky).abs() > math.cos(math.radians(MOST_TILT + 5.0))
+        normal, offset = normal[upright], offset[upright]
+    return normal, offset
+
+
+def _held(
+    points: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normals: Float[Tensor, "m 3"], offsets: Float[Tensor, "m"]
+) -> Bool[Tensor, "m n"]:
+    """Return which points are within twice the noise of each plane."""
+    held = torch.empty(len(normals), len(points), dtype=torch.bool)
+    for rows in torch.arange(len(normals)).split(500):
+        held[rows] = (normals[rows] @ points.T - offsets[rows, None]).abs_() < 2 * noise
+    return held
+
+
+def _refine(view: View, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
+    """Return the plane of weighted least squares with Tukey's weights, which change smoothly with the points."""
+    points, noise, scale = view.points, view.noise, 1.0
+    for _ in range(30):
+        ratio = (points @ normal - offset) / noise
+        core = ratio.abs() < 3 * scale
+        scale = min(max(float(1.4826 * ratio[core].abs().median()), 0.2), ROUGH) if bool(core.any()) else scale
+        weight = (1 - (ratio / (4.685 * scale)).square()).clamp_min(0).square() / noise.square()
+        weight = weight / weight.sum()
+        mean = weight @ points
+        offset_points = points - mean
+        spread = offset_points.T @ (weight[:, None] * offset_points)
+        turned = torch.linalg.eigh(spread).eigenvectors[:, 0]
+        turned = turned if float(turned @ normal) > 0 else -turned
+        moved = float(mean @ turned)
+        change = float((turned - normal).abs().max()) + abs(moved - offset)
+        normal, offset = turned, moved
+        if change < 1e-12:
+            break
+    on = ((points @ normal - offset).abs() / noise) < 3 * scale
+    return PlaneFit(normal, offset, scale, int(on.sum()))

@@ -1,0 +1,288 @@
+"""The supports in a view: planes that objects stand on, each with its region, found in points of any frame."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.checks import check_tensor
+from torchgrasp.cloud.plane_fit import LEAST_SHARE, MOST_TILT, REACH, ROUGH, PlaneFit, View, assume_noise, fit_planes
+from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane, as_plane
+
+MOST_THROUGH = 0.1  # greatest number of points seen through a support's region, over the number on it
+LEAST_STANDING = 0.001  # least share of the points that stand low on a support, over its region
+LEAST_WIDTH, FURNITURE = 0.14, 0.3
+"""Least width [m] of a support's region; a wider face than FURNITURE [m] belongs to no object that a hand grasps."""
+LOW = 0.06  # height [m] below which points of an object stand close to its support
+SUPPORT = "a plane with objects on it and nothing seen through it, or a table that is given"  # what a view must show
+
+
+@dataclasses.dataclass(frozen=True)
+class Support:
+    """A plane that objects stand on, and its region: the convex hull of the points on it.
+
+    Args:
+        plane: the plane; the camera is above it.
+        sides: outward unit vector and offset [m] of each vertical side of the region; None: an unbounded region.
+        width: smaller width of the region [m].
+    """
+
+    plane: Plane
+    sides: Float[Tensor, "s 4"] | None = None
+    width: float = math.inf
+
+    def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
+        """Return which points are over the region or at most `margin` [m] beside it; a negative margin shrinks it."""
+        if self.sides is None:
+            return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
+        sides = self.sides.to(points)
+        return (points @ sides[:, :3].T + sides[:, 3] < margin).all(-1)
+
+    def moved(self, shift: Float[Tensor, "3"]) -> "Support":
+        """Return the support after a translation [m]."""
+        plane = Plane(self.plane.normal, self.plane.offset + float(self.plane.normal @ shift))
+        sides = self.sides
+        if sides is not None:
+            sides = torch.cat([sides[:, :3], sides[:, 3:] - sides[:, :3] @ shift[:, None]], -1)
+        return Support(plane, sides, self.width)
+
+
+def find_table(
+    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], table: Plane | float | None, up: object
+) -> tuple[Support, ...]:
+    """Return the support on the given plane, or the supports that are found, with the camera above them."""
+    plane = as_plane(table)
+    direction = None if up is None else torch.as_tensor(up).double().cpu()
+    if plane is None:
+        return find_supports(points, viewpoint, direction)
+    if direction is not None and float(unit(direction) @ plane.normal.double()) < 0.5:
+        raise BadArgument("up", direction.tolist(), "a direction within 60 degrees of the table's normal")
+    if float(plane.height(viewpoint)) <= 0:
+        raise BadArgument("table", f"the camera {-float(plane.height(viewpoint)):.3g} m below it", "a table below it")
+    points, eye = points.double().cpu(), viewpoint.double().cpu()
+    points = points[:: 1 + len(points) // 20_000]
+    on = plane.height(points).abs() < 3 * assume_noise(points, eye)
+    return (bound(plane, points, on, eye) or Support(plane),)
+
+
+def fit_support(
+    points: Float[Tensor, "n 3"],
+    viewpoint: Float[Tensor, "3"] | None = None,
+    up: Float[Tensor, "3"] | None = None,
+    *,
+    seed: int = 0,
+) -> Plane:
+    """Return the plane of the most plausible support; see `find_supports`."""
+    return find_supports(points, viewpoint, up, seed=seed)[0].plane
+
+
+def find_supports(
+    points: Float[Tensor, "n 3"],
+    viewpoint: Float[Tensor, "3"] | None = None,
+    up: Float[Tensor, "3"] | None = None,
+    *,
+    seed: int = 0,
+) -> tuple[Support, ...]:
+    """Return the supports in a view, the most plausible first, whatever the frame.
+
+    Triples of points propose planes. An iterated fit with Tukey's weights refines each. Objects stand on a support,
+    over its region, and the camera sees nothing through the region. The support with the most points low above it comes
+    first; they count twice if the camera looks at it. Of parallel supports, a higher one as wide as furniture comes
+    first. A rigid motion of all arguments moves the supports alike.
+
+    Args:
+        points: everything that was seen [m].
+        viewpoint: the camera's position [m], on the upper side; None: the side with more points is the upper one.
+        up: against gravity, of any length; None: any direction.
+        seed: of the draws.
+
+    Raises:
+        BadArgument: a wrong shape or type, or points that are not finite.
+        NoSupport: no plane holds enough points; nothing stands on it; the camera sees through it, or is below it.
+    """
+    points = check_tensor("points", points, (None, 3)).detach().cpu().double()
+    eye = None if viewpoint is None else check_tensor("viewpoint", viewpoint, (3,)).detach().cpu().double()
+    sky = None if up is None else unit(check_tensor("up", up, (3,)).detach().cpu().double())
+    if len(points) < 50:
+        raise NoSupport("table", f"{len(points)} points", SUPPORT)
+    generator = torch.Generator().manual_seed(seed)
+    points = points[torch.randperm(len(points), generator=generator)[:20_000]]
+    centre = points.mean(0)
+    points = points - centre  # so that distant origins cost no digits
+    view = View(points, None if eye is None else eye - centre, sky)
+    found: list[_Candidate] = []
+    reasons: list[str] = []
+    for fit in fit_planes(view, generator):
+        judged = _judge(view, fit.turned_up(view))
+        if isinstance(judged, str):
+            reasons.append(judged)
+        elif not any(judged.repeats(other) for other in found):
+            found.append(judged)
+    if not found:
+        raise NoSupport("table", reasons[0] if reasons else "no plane with enough points", SUPPORT)
+    return tuple(candidate.support.moved(centre) for candidate in _ordered(found))
+
+
+def bound(
+    plane: Plane, points: Float[Tensor, "n 3"], on: Bool[Tensor, "n"], eye: Float[Tensor, "3"] | None
+) -> Support | None:
+    """Return the support on a plane, bounded by the connected points on it; None: too few points.
+
+    The region is the convex hull of the largest part. Another large part joins it if the camera sees nothing through
+    the hull of both: an object hides what lies between.
+    """
+    if int(on.sum()) < 3:
+        return None
+    normal, middle = plane.normal.to(points), points[on].mean(0)
+    side = points[on][0] - middle
+    x = unit(side - (side @ normal) * normal)
+    axes = torch.stack([x, torch.linalg.cross(normal, x)], -1)
+    crossing, behind = cross(plane, points, eye)
+    flat, lower = (((p - middle) @ axes) for p in (points[on], crossing[behind & ~on]))
+    region = None
+    for part in _parts(flat):
+        grown = _Hull.of(part if region is None else torch.cat([region.corners, part]))
+        if region is None or int((grown.holds(lower) & ~region.holds(lower)).sum()) < 0.05 * len(part):
+            region = grown
+    if region is None:
+        return None
+    outward = region.sides[:, :2] @ axes.T
+    return Support(plane, torch.cat([outward, (region.sides[:, 2] - outward @ middle)[:, None]], -1), region.width)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Hull:
+    """A convex polygon: its corners [m], and outward unit normal and offset of each side."""
+
+    corners: Float[Tensor, "k 2"]
+    sides: Float[Tensor, "s 3"]
+
+    @classmethod
+    def of(cls, points: Float[Tensor, "n 2"]) -> "_Hull":
+        """Return the convex hull of points in a plane."""
+        from scipy.spatial import ConvexHull
+
+        hull = ConvexHull(points.numpy())
+        return cls(points[torch.from_numpy(hull.vertices).long()], torch.from_numpy(hull.equations))
+
+    def holds(self, points: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
+        """Return which points are inside."""
+        return (points @ self.sides[:, :2].T + self.sides[:, 2] < 0).all(-1)
+
+    @property
+    def width(self) -> float:
+        """The smallest distance [m] of two parallel lines that enclose the polygon."""
+        return -float((self.corners @ self.sides[:, :2].T + self.sides[:, 2]).amin(0).amax())
+
+
+def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
+    """Yield the connected parts of points in a plane by falling size, down to a fiftieth of the largest.
+
+    Square cells of 3 cm are closed over gaps and opened, which drops strips where other surfaces cross the plane.
+    """
+    from scipy.ndimage import binary_closing, binary_opening, label
+
+    cells = torch.floor(flat / 0.03).long()
+    cells = cells - cells.amin(0) + 3
+    grid, box = np.zeros((cells.amax(0) + 4).tolist(), dtype=bool), np.ones((3, 3))
+    grid[tuple(cells.T.numpy())] = True
+    labels = np.empty(grid.shape, dtype=np.int32)
+    label(binary_opening(binary_closing(grid, box, iterations=2), box), output=labels)
+    own = torch.from_numpy(labels[tuple(cells.T.numpy())]).long()
+    count = torch.bincount(own)[1:]
+    for k in torch.argsort(count, descending=True, stable=True).tolist():
+        if count[k] >= 0.02 * count.max():
+            yield flat[own == k + 1]
+
+
+def cross(
+    plane: Plane, points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None
+) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+    """Return where the rays through points cross a plane, and which points lie behind it.
+
+    Without a camera, the rays are vertical, and points more than `REACH` below the plane do not count.
+    """
+    height = plane.height(points)
+    if eye is None:
+        return points, (height < 0) & (height > -REACH)
+    above = float(plane.height(eye))
+    ratio = above / (above - height).clamp_min(1e-9)
+    return eye + ratio[:, None] * (points - eye), height < 0
+
+
+@dataclasses.dataclass(frozen=True)
+class _Candidate:
+    """A support, its score, and a point in the middle of its region."""
+
+    support: Support
+    score: float
+    middle: Float[Tensor, "3"]
+
+    def parallel(self, other: "_Candidate") -> bool:
+        """Return whether two planes are parallel within ten degrees."""
+        return float(self.support.plane.normal @ other.support.plane.normal) > 0.985
+
+    def repeats(self, other: "_Candidate") -> bool:
+        """Return whether a candidate is another fit of the same plane."""
+        return self.parallel(other) and abs(float(other.support.plane.height(self.middle))) < 0.02
+
+
+def _ordered(found: list[_Candidate]) -> list[_Candidate]:
+    """Return the candidates, the most plausible first."""
+    first = max(found, key=lambda candidate: candidate.score)
+    higher = [
+        candidate
+        for candidate in found
+        if candidate.parallel(first)
+        and candidate.support.width > FURNITURE
+        and float(first.support.plane.height(candidate.middle)) > 0
+    ]
+    first = max(higher, key=lambda candidate: candidate.score, default=first)
+    return [first, *sorted((c for c in found if c is not first), key=lambda candidate: -candidate.score)]
+
+
+def _judge(view: View, fit: PlaneFit) -> _Candidate | str:
+    """Return a plane as a candidate, or why it is no support."""
+    points, height = view.points, view.points @ fit.normal - fit.offset
+    tolerance = 4 * fit.scale * view.noise + 0.001
+    share = fit.count / len(points)
+    if share < LEAST_SHARE:
+        return f"no plane with more than {share:.1%} of the points"
+    if fit.scale >= ROUGH:
+        return "no flat plane"
+    if view.sky is not None and float(fit.normal @ view.sky) < math.cos(math.radians(MOST_TILT)):
+        return f"no plane within {MOST_TILT:g} degrees of level"
+    on = height.abs() < tolerance
+    plane = Plane(fit.normal, fit.offset)
+    support = bound(plane, points, on, view.eye)
+    if support is None or support.width < LEAST_WIDTH:
+        return f"a flat face about {0.0 if support is None else support.width:.2f} m wide"
+    middle = points[on & support.covers(points)].mean(0)
+    if view.eye is not None and float(unit(view.eye - middle) @ fit.normal) < math.sin(math.radians(5.0)):
+        return "a plane that the camera does not see from above"
+    inner = 0.05 * support.width
+    crossing, behind = cross(plane, points, view.eye)
+    through = int((behind & (height < -tolerance) & support.covers(crossing, -inner)).sum())
+    if through > MOST_THROUGH * fit.count:
+        return f"a plane with {share:.0%} of the points, but {through / len(points):.0%} of them below it"
+    low = (height > tolerance) & (height < LOW)
+    # Low points of an object are over the plane's own region. A pan's rim is not over its floor.
+    standing = int((low & support.covers(points, -inner)).sum())
+    if standing < LEAST_STANDING * len(points) or standing < 0.05 * int(low.sum()):
+        return f"a plane with {share:.0%} of the points and nothing that stands on it"
+    return _Candidate(support, standing * (2.0 if _looked_at(view, fit, support) else 1.0), middle)
+
+
+def _looked_at(view: View, fit: PlaneFit, support: Support) -> bool:
+    """Return whether the middle of the view meets the region of a support."""
+    if view.eye is None:
+        return True
+    ahead = unit(view.points - view.eye).mean(0)
+    distance = (fit.offset - float(view.eye @ fit.normal)) / float(ahead @ fit.normal)
+    return distance > 0 and bool(support.covers(view.eye + distance * ahead))
