@@ -84,8 +84,8 @@ class MissingExtra(GraspError, ImportError):
 class IndefiniteCovariance(GraspError, ValueError):
     """A covariance matrix is not positive definite. The library never adds jitter."""
 
-    def __init__(self, what: str, smallest_eigenvalue: float, remedy: str):
-        super().__init__(f"{what} is not positive definite (smallest eigenvalue {smallest_eigenvalue:.3g}): {remedy}")
+    def __init__(self, what: str, smallest_eigenvalue: float, fix: str):
+        super().__init__(f"{what} is not positive definite (smallest eigenvalue {smallest_eigenvalue:.3g}): {fix}")
         self.smallest_eigenvalue = smallest_eigenvalue
 
 

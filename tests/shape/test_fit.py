@@ -97,7 +97,7 @@ def test_paper_support_observes_what_the_paper_does():
 
 
 @pytest.mark.parametrize("support", ["camera", "paper"])
-def test_the_papers_psi_raises_and_its_remedy_works(support: str):
+def test_the_papers_psi_raises_and_its_fix_works(support: str):
     with pytest.raises(IndefiniteCovariance, match=r"psi_scale of at least 1\.34"):
         fit_shape(_cylinder(), psi_scale=1.0, support=support)  # pyright: ignore[reportArgumentType]
     fit_shape(_cylinder(), psi_scale=1.34, support=support)  # pyright: ignore[reportArgumentType]

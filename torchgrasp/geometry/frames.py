@@ -1,7 +1,7 @@
 """Rigid transforms, and the virtual frame of three contacts (Eqs. 15-17).
 
-A transform `a_from_b` maps coordinates of frame b into frame a. So chains read by adjacency:
-`obj_from_hand = obj_from_vf @ vf_from_hand` (Eq. 24).
+A transform `a_from_b` maps coordinates of frame b into frame a. Products therefore chain adjacent names: `obj_from_hand
+= obj_from_vf @ vf_from_hand` (Eq. 24).
 """
 
 import itertools
@@ -23,18 +23,18 @@ def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"])
 
 
 def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
-    """Return `b_from_a` of a rigid transform."""
+    """Return the inverse `b_from_a` of a rigid transform `a_from_b`."""
     rotation = a_from_b[..., :3, :3].transpose(-1, -2)
     return rigid(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
 
 
 def apply(a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
-    """Map points of frame b into frame a."""
+    """Map points from frame b to frame a."""
     return points @ a_from_b[..., :3, :3].transpose(-1, -2) + a_from_b[..., None, :3, 3]
 
 
 def rotate(a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
-    """Map directions of frame b into frame a."""
+    """Map directions from frame b to frame a."""
     return directions @ a_from_b[..., :3, :3].transpose(-1, -2)
 
 
@@ -80,12 +80,12 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
-    """Return all choices of `size` of the numbers below `count`, in their order."""
+    """Return all subsets of `size` numbers below `count`, in lexical order."""
     return torch.tensor(list(itertools.combinations(range(count), size)), device=device)
 
 
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
-    """Return which contacts lie near a line: their largest triangle is too flat."""
+    """Return which contact sets lie nearly on a line: even their largest triangle is too flat."""
     # Least height of the largest contact triangle over its longest side: noise turns the frame of a flatter one
     min_ratio = 1e-3
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
@@ -98,14 +98,14 @@ def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
 def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the virtual frame of three contacts, Eqs. (15)-(17): `a_from_vf` for points given in frame a.
 
-    The origin is the centre of the contacts (Eq. 16). The x axis points from the first contact to the third. The z axis
-    is the normal of their plane.
+    The origin is the centroid of the contacts (Eq. 16). The x axis points from the first contact to the third. The z
+    axis is the normal of their plane.
 
     Args:
         points: contacts or fingertips [m] in the order of the fingers.
 
     Raises:
-        DegenerateContacts: a triangle is flatter than `MIN_HEIGHT_RATIO`.
+        DegenerateContacts: the contacts lie nearly on a line.
     """
     flat = degenerate(points)
     if bool(flat.any()):

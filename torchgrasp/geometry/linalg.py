@@ -19,7 +19,7 @@ def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
 
 
 def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-    """Return `unit` of vectors whose squares may overflow or vanish; all other vectors have the bits of `unit`."""
+    """Return unit vectors also where squared lengths would overflow or underflow; otherwise the bits of `unit`."""
     exponent = torch.frexp(v.abs().amax(-1, keepdim=True)).exponent - 1
     return unit(v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent))  # a power of two rounds nothing
 
@@ -40,41 +40,42 @@ def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start:
 
 
 def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"]:
-    """Return vectors shortened to the length `longest` where they are longer."""
+    """Return the vectors, shortened to the length `longest` where they are longer."""
     return v * (longest / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(longest))
 
 
 def solve_least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]) -> Float[Tensor, "k"]:
-    """Return the shortest x that minimises |rows x - values|, by singular values.
+    """Return the shortest x that minimises |rows x - values|, by the pseudo-inverse.
 
-    `torch.linalg.lstsq` is not used: on a processor it does not set its first column pivots, so the last digits differ
-    from call to call.
+    `torch.linalg.lstsq` is not used: on a CPU its column pivots are undefined, so the last digits differ from call to
+    call.
     """
     return torch.linalg.pinv(rows) @ values
 
 
-def cholesky(matrix: Float[Tensor, "*b n n"], what: str, remedy: str) -> Float[Tensor, "*b n n"]:
+def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tensor, "*b n n"]:
     """Return the lower Cholesky factor, without jitter.
 
     Raises:
-        IndefiniteCovariance: with the smallest eigenvalue and the `remedy`.
+        IndefiniteCovariance: the matrix is not positive definite; the message names `what`, the smallest eigenvalue and
+            the `fix`.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not bool((info == 0).all() & torch.isfinite(factor).all()):  # one wait for the device
         finite = bool(torch.isfinite(matrix).all())
         smallest = float(torch.linalg.eigvalsh(matrix).min()) if finite else float("nan")
-        raise IndefiniteCovariance(what, smallest, remedy)
+        raise IndefiniteCovariance(what, smallest, fix)
     return factor
 
 
 def squared_mahalanobis(difference: Float[Tensor, "*b d"], factor: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b"]:
-    """Return x^T Sigma^-1 x for the lower Cholesky factor of Sigma."""
+    """Return the squared Mahalanobis distance x^T Sigma^-1 x; `factor` is the lower Cholesky factor of Sigma."""
     whitened = torch.linalg.solve_triangular(factor, difference[..., None], upper=False)[..., 0]
     return (whitened * whitened).sum(-1)
 
 
 def squared_distance(points: Float[Tensor, "n d"], one: Float[Tensor, "d"]) -> Float[Tensor, "n"]:
-    """Return the squared Euclidean distance of each point from one."""
+    """Return the squared Euclidean distance of each point from a single point."""
     return (points - one).square().sum(-1)
 
 
@@ -86,15 +87,15 @@ def farthest_points(
     distance: Callable[[Tensor, Tensor], Tensor] = squared_distance,
     before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points, each the farthest from all points before it.
+    """Return the indices of at most `count` points, each the farthest from those before (farthest-point sampling).
 
     Args:
         points: any values that `distance` compares.
         count: the number of points.
-        first: index of the point to begin with.
-        tie: relative difference of distances that counts as none; of equally far points the first is taken.
-        distance: the distance of each point from one of them.
-        before: points that count as picked before, and are not returned; with any, `first` is not used.
+        first: index of the first point.
+        tie: relative difference up to which distances count as equal; of equally far points the first is taken.
+        distance: function that returns the distance of each point from a single point.
+        before: points that count as already picked and are not returned; `first` is then not used.
     """
     if distance is squared_distance and before is None and points.device.type == "cpu" and points.ndim == 2:
         return torch.from_numpy(_farthest_on_cpu(points.detach().numpy(), min(count, len(points)), first, tie))
@@ -111,7 +112,7 @@ def farthest_points(
 
 
 def _farthest_on_cpu(points: np.ndarray, count: int, first: int, tie: float) -> np.ndarray:
-    """Return `farthest_points` by NumPy, whose calls are quicker than torch's for few points."""
+    """Return `farthest_points` in NumPy, which is faster than torch for few points."""
     x, picks = np.ascontiguousarray(points.T), np.full(count, first)
     nearest = np.full(len(points), np.inf, dtype=x.dtype)
     for k in range(1, count):
@@ -122,11 +123,11 @@ def _farthest_on_cpu(points: np.ndarray, count: int, first: int, tie: float) -> 
 
 
 def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
-    """Mirror points across the plane n.x = o."""
+    """Mirror points across planes n.x = o, given as (n, o)."""
     height = (points * plane[..., :3]).sum(-1, keepdim=True) - plane[..., 3:]
     return points - 2.0 * height * plane[..., :3]
 
 
 def reflect_directions(directions: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
-    """Mirror directions across a plane."""
+    """Mirror directions across planes n.x = o, given as (n, o)."""
     return directions - 2.0 * (directions * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]

@@ -1,4 +1,4 @@
-"""Triangle meshes: reading and checks, cutting along a field, closest points of triangles."""
+"""Triangle meshes: reading and checks, clipping by a field, closest points on triangles."""
 
 import contextlib
 import io
@@ -27,10 +27,10 @@ LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
-    """Return a closed mesh [m], checked and never repaired.
+    """Read a closed mesh [m] from a file, or check a given one; a bad mesh is never repaired.
 
     Raises:
-        MeshError: no mesh in the file, another format than `SUFFIXES`, or more than `MESH_BYTES` or `MESH_FACES`;
+        MeshError: no mesh in the file, a format other than `SUFFIXES`, or more than `MESH_BYTES` or `MESH_FACES`;
             non-finite vertices, an open surface, faces that are not all turned outward, or no volume.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
     """
@@ -58,7 +58,7 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 
 
 def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
-    """Raise `MeshError` unless a mesh bounds a volume."""
+    """Raise `MeshError` unless a mesh encloses a volume."""
     if not 0 < len(mesh.faces) <= MESH_FACES:
         raise MeshError(
             "mesh", f"{name} of {len(mesh.faces)} faces", f"a closed mesh of at most {MESH_FACES} triangles"
@@ -79,9 +79,9 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
 
 
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the closest point of each triangle (n, 3 corners, 3) to each point, and its feature.
+    """Return the point of each triangle (n, 3 corners, 3) closest to its point (n, 3), and where it lies.
 
-    Features: 0 the face, 1 to 3 the sides ab, bc, ca, 4 to 6 the corners a, b, c.
+    The second result is 0 for the face, 1 to 3 for the sides ab, bc, ca, and 4 to 6 for the corners a, b, c.
     """
     a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     w = points - a
@@ -104,13 +104,13 @@ def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.
 
 
 def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the part of a mesh on which a field is negative, and which vertices the cut made.
+    """Return the part of a mesh where a field is negative, and a mask of the vertices made by the cut.
 
-    Triangles that the zero level crosses are cut along it, the field taken as linear in each.
+    Triangles are cut along the zero level; the field is linear within each triangle.
 
     Args:
-        vertices: of shape (v, 3).
-        faces: of shape (f, 3).
+        vertices: vertices (v, 3).
+        faces: triangles (f, 3).
         values: the field at the vertices (v,).
     """
     keep = values < 0
@@ -143,12 +143,12 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Return the mesh that trimesh reads from the bytes of a file; a malformed file may raise any exception.
+    """Read a mesh from the bytes of a file with trimesh; a malformed file may raise any exception.
 
     Args:
-        data: of the file.
+        data: content of the file.
         suffix: one of `SUFFIXES`.
-        options: of `trimesh.load_mesh`.
+        options: options of `trimesh.load_mesh`.
 
     Raises:
         ValueError: more than `MESH_FACES`, or a header beyond `PLY_PROPERTIES` or `PLY_HEADER_BYTES`.
@@ -165,7 +165,7 @@ def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
 
 @contextlib.contextmanager
 def _quiet(log: logging.Logger) -> Iterator[None]:
-    """Drop the log records of this thread: Python would print them on stderr."""
+    """Suppress the log records of this thread, which Python would print on stderr."""
     here = threading.get_ident()
 
     def drop(record: logging.LogRecord) -> bool:
@@ -179,7 +179,7 @@ def _quiet(log: logging.Logger) -> Iterator[None]:
 
 
 def _count_faces(data: bytes, suffix: str) -> int:
-    """Return the number of faces that a file declares; 0 if only its size bounds them."""
+    """Return the number of faces that a file declares; 0 if the format bounds it by the file's size."""
     if suffix == ".obj":
         return data.count(b"\nf")
     if suffix == ".stl":
@@ -189,7 +189,7 @@ def _count_faces(data: bytes, suffix: str) -> int:
 
 
 def _read_header(data: bytes) -> int:
-    """Return the number of faces in the header of a .ply, read as leniently as trimesh does."""
+    """Return the number of faces in the header of a .ply file, which is read as leniently as trimesh does."""
     properties = faces = 0
     for line in io.BytesIO(data[:PLY_HEADER_BYTES]):
         words = line.split()
@@ -206,7 +206,7 @@ def _read_header(data: bytes) -> int:
 
 
 def _geometry(data: bytes) -> bytes:
-    """Return only the vertices and faces of an .obj: trimesh is slow with many groups or materials."""
+    """Return only the vertex and face lines of an .obj file, because trimesh is slow with many groups or materials."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     kept = (line for line in map(bytes.strip, lines) if line[:2] in (b"v ", b"f ", b"v\t", b"f\t"))
     return b"\n".join(line if line[:1] == b"v" else _REFERENCE.sub(b"", line) for line in kept)

@@ -1,6 +1,6 @@
-"""Levenberg-Marquardt for a batch of small problems, each row with its own damping.
+"""Levenberg-Marquardt for a batch of small problems; each problem has its own state and damping.
 
-`levenberg_marquardt` is the loop. A `Problem` says how steps are made and judged. See Nocedal and Wright, Numerical
+`levenberg_marquardt` is the loop. A `Problem` defines steps and their acceptance. See Nocedal and Wright, Numerical
 Optimization, ch. 10.
 """
 
@@ -20,7 +20,7 @@ SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
 
 @dataclasses.dataclass(frozen=True)
 class Linearisation(Batch):
-    """The cost of rows at a state; a problem adds its linear model."""
+    """The costs of a batch at its states; subclasses add the linear model."""
 
     cost: Float[Tensor, "a"]
 
@@ -35,17 +35,17 @@ Model = TypeVar("Model", bound=Linearisation)
 
 
 class Problem(abc.ABC, Generic[State, Model]):
-    """A cost for each row, with the rules by which steps are made and judged."""
+    """A batch of minimisation problems: costs, steps and rules of acceptance."""
 
     first_damping: float = 1e-2
 
     @abc.abstractmethod
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> Model:
-        """Return cost and linear model of some rows at their states."""
+        """Return cost and linear model of the problems with indices `rows`, at their states."""
 
     @abc.abstractmethod
     def step(self, model: Model, damping: Damping) -> Steps:
-        """Solve the damped normal equations."""
+        """Return the solution of the damped normal equations, and which problems go on."""
 
     @abc.abstractmethod
     def move(self, state: State, x: Float[Tensor, "a d"]) -> State:
@@ -53,18 +53,18 @@ class Problem(abc.ABC, Generic[State, Model]):
 
     @abc.abstractmethod
     def judge(self, model: Model, trial: Model, x: Float[Tensor, "a d"], damping: Damping) -> Verdict:
-        """Compare the models before and after a step."""
+        """Return which steps are accepted, and the next damping, given the models before and after the step."""
 
     def refuse(self, model: Model, trial: Model) -> Model:
-        """Return the model after a refused step: by default the one before."""
+        """Return the model to use after a rejected step: by default the model before the step."""
         return model
 
 
 @torch.no_grad()
 def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int) -> tuple[State, Float[Tensor, "b"]]:
-    """Lower the cost of every row by damped Gauss-Newton steps of one evaluation each; return states and costs.
+    """Minimise every problem of a batch by damped Gauss-Newton steps; return final states and costs.
 
-    No gradient flows through it: without a graph its many small operations are quicker.
+    Each step costs one evaluation. No gradient flows through the minimisation.
     """
     whole, rows = state, torch.arange(len(state))
     model = problem.linearise(state, rows)
@@ -92,7 +92,7 @@ Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
 
 @dataclasses.dataclass(frozen=True)
 class LinearResiduals(Linearisation):
-    """Residuals and their Jacobian at a state."""
+    """Residuals and their Jacobian at the states of a batch."""
 
     residual: Float[Tensor, "a m"]
     jacobian: Float[Tensor, "a m d"]
@@ -100,12 +100,12 @@ class LinearResiduals(Linearisation):
 
 @dataclasses.dataclass(frozen=True)
 class LeastSquares(Problem[State, LinearResiduals]):
-    """The sum of squared residuals of each row.
+    """A batch of least-squares problems: the cost is the sum of squared residuals.
 
     Args:
-        residuals: returns residuals and Jacobian of some rows at their states.
+        residuals: returns residuals and Jacobian of the problems with given indices, at their states.
         moved: returns the states after a step.
-        solved: sum of squares at which a row ends.
+        solved: sum of squares at which a problem is solved.
         largest: largest change of a variable in one step.
     """
 
@@ -120,7 +120,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Damping) -> Steps:
-        """Return the damped step, at most `largest`; zero where there is no factor yet."""
+        """Return the damped step, no variable changed by more than `largest`; zero where the matrix is singular."""
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.
@@ -137,7 +137,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
     def judge(
         self, model: LinearResiduals, trial: LinearResiduals, x: Float[Tensor, "a d"], damping: Damping
     ) -> Verdict:
-        """Accept what lowers the sum."""
+        """Accept a step that lowers the cost; stop a problem that has converged or is stuck."""
         lost = 30.0  # damping beyond which a refused step ends a row of `LeastSquares`
         stalled = 0.02  # relative decrease of the sum of squares below which a row of `LeastSquares` has converged
         better = trial.cost < model.cost

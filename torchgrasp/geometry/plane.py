@@ -1,7 +1,7 @@
-"""The plane of support, and the upright frame in which the library computes.
+"""The table plane, and the upright frame in which the library computes.
 
-Results must not depend on the frame of the camera or the robot. So public functions bring their arguments into a frame
-that only scene and camera determine, and bring the results back.
+Results must not depend on the frame of the camera or the robot. So public functions transform their arguments into a
+frame that only scene and camera determine, and transform the results back.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ LEAST_TILT = 0.05
 @checked
 @dataclasses.dataclass(frozen=True)
 class Plane(Value):
-    """A plane of support: the points p with normal . p = offset. Objects stand on the side of the normal.
+    """A table plane: the points p with normal . p = offset. Objects stand on the side of the normal.
 
     Args:
         normal: unit vector that points up.
@@ -53,7 +53,6 @@ class Plane(Value):
     offset: float
 
     def __post_init__(self) -> None:
-        """Check the length of the normal."""
         length = float(torch.linalg.vector_norm(self.normal))
         if not abs(length - 1) < 1e-4:
             raise BadArgument("normal", f"a vector of length {length:g}", "a unit vector")
@@ -66,7 +65,7 @@ class Plane(Value):
 
     @functools.cached_property
     def components(self) -> tuple[float, float, float]:
-        """The normal as numbers of Python, read from its device once."""
+        """The normal as three Python numbers."""
         x, y, z = self.normal.tolist()
         return x, y, z
 
@@ -77,7 +76,7 @@ class Plane(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Plane":
-        """Return the plane in frame b; it is given in frame a.
+        """Return the plane transformed from frame a to frame b.
 
         >>> floor_from_table = torch.eye(4)
         >>> floor_from_table[2, 3] = 0.5
@@ -88,7 +87,7 @@ class Plane(Value):
         return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))
 
     def describe(self) -> str:
-        """Return the numbers as text.
+        """Return normal and offset as text.
 
         >>> Plane.horizontal(0.1).describe()
         'normal 0 0 1, offset 0.1'
@@ -98,7 +97,7 @@ class Plane(Value):
 
 
 def as_plane(table: Plane | float | None) -> Plane | None:
-    """Return the plane of a table that is given as a plane, as a height [m] along z, or as None."""
+    """Return a table as a plane: from a plane, a height [m] along z, or None."""
     if table is None or isinstance(table, Plane):
         return table
     if isinstance(table, bool) or not isinstance(table, int | float) or not math.isfinite(table):
@@ -109,16 +108,17 @@ def as_plane(table: Plane | float | None) -> Plane | None:
 def upright_frame(
     points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*v 3"] | None = None, table: Plane | None = None
 ) -> Float[Tensor, "4 4"]:
-    """Return `obj_from_upright`, a frame that moves with points, camera and table.
+    """Return `obj_from_upright`: the pose of a frame that is fixed to points, camera and table.
 
-    The z axis is the table's normal, else the direction to the camera, else the least principal axis of the points.
-    The x axis points level towards the camera. A camera straight above has no level direction. Then x points to the
-    point farthest from the vertical through the points' centre. The origin is on this vertical, on the table if any.
+    The z axis is the table's normal; without table the direction to the camera; without both the least principal axis
+    of the points. The x axis is horizontal and points towards the camera. If the camera is straight above, x points to
+    the point farthest from the vertical through the points' centroid. The origin is on this vertical, on the table if
+    there is one.
 
     Args:
-        points: of a cloud [m].
+        points: points of a cloud [m].
         viewpoint: position of the camera [m], or one position for each point.
-        table: in the frame of the points.
+        table: table plane in the frame of the points.
 
     Raises:
         BadArgument: most points are below the table.
@@ -159,12 +159,12 @@ def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> S
 
 
 def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round to multiples of `GRID`, with a phase: float32 numbers would often lie halfway between two multiples."""
+    """Round to multiples of `GRID` plus a phase: float32 numbers often lie halfway between two multiples."""
     return torch.round(x / GRID + 1 / math.pi) * GRID
 
 
 def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value of `torchgrasp.values` in frame b [m]; it is given in frame a."""
+    """Return a value of `torchgrasp.values`, transformed from frame a to frame b [m]."""
 
     def moved(name: str, x: Any) -> Any:
         if isinstance(x, Value):

@@ -1,4 +1,4 @@
-"""A signed distance field of an object's surface, for collision."""
+"""Signed distance fields on grids, for collision checks."""
 
 import dataclasses
 from functools import cached_property
@@ -46,7 +46,7 @@ class SignedDistanceField(Value):
 
     @checked(gradients=True)
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the value [m] at the nearest node, at most 0.87 spacings away; outside the grid it is too small."""
+        """Return the signed distance [m] at the grid node nearest to each point; outside the grid it is too small."""
         flat = 0
         for x, low, count in zip(points.unbind(-1), self.origin.to(points), self.values.shape, strict=True):
             node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
@@ -55,7 +55,10 @@ class SignedDistanceField(Value):
 
     @checked(gradients=True)
     def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return the trilinear signed distance [m] and its gradient; beyond the grid the distance to it is added."""
+        """Return the interpolated signed distance [m] and its gradient.
+
+        Outside the grid the distance to the grid is added.
+        """
         _, ny, nz = self.values.shape
         position = (points - self.origin.to(points)) / self.spacing
         inside = torch.minimum(position.clamp_min(0), self._last_node.to(points))
@@ -84,7 +87,7 @@ def field_from_surface(
     spacing: Annotated[float, Range(0.0001, 0.1)] = 0.003,
     margin: Annotated[float, Range(0.0, 1.0)] = 0.08,
 ) -> SignedDistanceField:
-    """Return the signed distance field of a triangle mesh [m], wound outward; it may be open.
+    """Return the signed distance field of a triangle mesh [m] with outward faces; the mesh may be open.
 
     The nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh.
 
@@ -113,16 +116,16 @@ def field_from_surface(
 
 
 def _keep(known: np.ndarray) -> np.ndarray:
-    """Return which nodes of a grid twice as fine are known: every second along each axis."""
+    """Return which nodes of a grid twice as fine are already known: every second along each axis."""
     fine = np.zeros([2 * count - 1 for count in known.shape], dtype=bool)
     fine[::2, ::2, ::2] = known
     return fine
 
 
 def _refine(values: np.ndarray) -> np.ndarray:
-    """Return values of a grid twice as fine: cubics through the distances, with the sign of the previous node.
+    """Return the values interpolated to a grid twice as fine: cubic in the distance, sign of the previous node.
 
-    Far from an open mesh the sign jumps, and a cubic through signed distances would be wrong.
+    Far from an open mesh the sign jumps, where a cubic of signed distances would be wrong.
     """
     sign, distance = values < 0, np.abs(values)
     for axis in range(3):
@@ -131,7 +134,7 @@ def _refine(values: np.ndarray) -> np.ndarray:
 
 
 def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
-    """Return values with one more between each two along an axis: a cubic, or the previous value of a sign."""
+    """Return the values with a new one between every two along an axis: cubic, or for signs the previous value."""
     known = np.moveaxis(values, axis, 0)
     fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=known.dtype)
     fine[::2] = known
@@ -144,7 +147,7 @@ def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 class _Surface:
-    """A search tree over samples of a mesh, which finds near triangles."""
+    """The triangles of a mesh with a search tree over surface samples, to find the distances of points."""
 
     def __init__(self, vertices: Tensor, faces: Tensor):
         from scipy.spatial import KDTree
@@ -184,9 +187,9 @@ class _Surface:
 
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
-    """Return pseudonormals (f, 7, 3) of each triangle's face, sides and corners (Baerentzen and Aanaes, 2005).
+    """Return the pseudonormals (f, 7, 3) of each triangle's face, sides and corners (Baerentzen and Aanaes, 2005).
 
-    Sides add up the normals of two faces, corners the normals of all faces, weighted by angle.
+    A side has the sum of the normals of its two faces, a corner that of all its faces, weighted by angle.
     """
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.linalg.norm(face, axis=1, keepdims=True)
@@ -202,7 +205,7 @@ def _pseudonormals(corners: np.ndarray) -> np.ndarray:
 
 
 def _alike(points: np.ndarray) -> np.ndarray:
-    """Return a number for each point (n, 3); equal points have equal numbers."""
+    """Return an integer for each point (n, 3), the same for equal points."""
     order = np.lexsort(points.T)
     new = (points[order[1:]] != points[order[:-1]]).any(1)
     number = np.empty(len(points), dtype=np.int64)
@@ -211,5 +214,5 @@ def _alike(points: np.ndarray) -> np.ndarray:
 
 
 def _sum_by(number: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return the sums of the vectors (n, 3) that have the same number."""
+    """Return the sums of those vectors (n, 3) that have the same number."""
     return np.stack([np.bincount(number, weights=column) for column in vectors.T], 1)

@@ -1,8 +1,8 @@
 """Inverse kinematics: hand configurations that reach planned contacts.
 
-Seeds (`seeds`) are refined in rounds (`attempts`) and checked by geometry (`candidates`). Four solvers share these
-parts: `solve_ik` reaches given contacts, `solve_contact_first` makes grasps on fixed contacts, `solve_joint` lets the
-contacts slide, and `solve_as_paper` is the paper's.
+Initial guesses (`seeds`) are refined in rounds (`attempts`) and checked by geometry (`candidates`). Four solvers share
+these parts: `solve_ik` reaches given contacts, `solve_contact_first` makes grasps on fixed contacts, `solve_joint` lets
+the contacts slide, and `solve_as_paper` is the paper's solver.
 """
 
 from torchgrasp.ik.candidates import GraspProblem

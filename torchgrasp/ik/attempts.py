@@ -1,4 +1,4 @@
-"""The hand on fixed contacts: the best seeds of each row, then more seeds of unsolved rows; COBYLA as in the paper."""
+"""Solvers on fixed contacts: the best seeds of each contact set, then more seeds; the paper's COBYLA solver."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -34,14 +34,14 @@ FAR = 20.0  # clearance [mm] above which clearances are not distinguished
 
 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
-    """Return each seed's contacts in the order of the fingers."""
+    """Return the contacts of each seed, reordered so that contact i belongs to finger i."""
     return map_tensors(lambda x: x[seeds.row[:, None], seeds.permutation], contacts)
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined seeds, and the `unsolved` rows of contacts.
+    """The results of all refined seeds, and a mask of the contact sets that are still `unsolved`.
 
-    `solves` returns which results solve their rows.
+    The function `solves` returns which results solve their contact sets.
     """
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
@@ -49,19 +49,19 @@ class Attempts(Generic[Result]):
         self.results, self.rows = list[Result](), list[Tensor]()
 
     def add(self, results: Result, row: Int[Tensor, "k"]) -> None:
-        """Add results with the numbers of their rows."""
+        """Add results, with the index of the contact set of each result."""
         self.results.append(results)
         self.rows.append(row)
         self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
 
     def choose(self, seeds: IKSeeds, rank: Int[Tensor, "g"], first: int, count: int) -> IKSeeds:
-        """Return `count` seeds of each unsolved row, from rank `first` on."""
+        """Return `count` seeds of each unsolved contact set, from rank `first` on."""
         return seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
 
     def refine(
         self, seeds: IKSeeds, rank: Int[Tensor, "g"], counts: Sequence[int], refine: Callable[[IKSeeds], Result]
     ) -> None:
-        """Refine the next `counts[k]` seeds of each unsolved row in round k, in the order of `rank`."""
+        """Refine the next `counts[k]` seeds of each unsolved contact set in round k, in the order of `rank`."""
         first = 0
         for count in counts:
             chosen = self.choose(seeds, rank, first, count)
@@ -70,19 +70,22 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return the first result of each row by `lexical_order` of the keys, and its row."""
+        """Return the best result of each contact set, by `lexical_order` of the keys, and the index of its set."""
         results, row = join(self.results), torch.cat(self.rows)
         first = rank_in_group(row, *keys(results)) == 0
         return results[first], row[first]
 
 
 def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
-    """Return which grasps passed every check."""
+    """Return which grasps have passed every check."""
     return grasps.status == Status.OK
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return the best grasp of each row, and its row: a success, else a failure of certified contacts, else any."""
+    """Return the best grasp of each contact set, and the index of its set.
+
+    A success is best, then a failure on certified contacts, then any failure; ties are broken by score.
+    """
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~executable(grasps)
@@ -92,12 +95,12 @@ def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
 
 
 def best_first(grasps: Grasps) -> Grasps:
-    """Return executable grasps first, then by score."""
+    """Sort grasps: executable grasps first, then by decreasing score."""
     return grasps[lexical_order((~executable(grasps)).int(), -grasps.score)]
 
 
 def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Grasps:
-    """Return a checked grasp on fixed contacts for each seed."""
+    """Refine each seed on its fixed contacts; return checked grasps."""
     contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
     configuration = refine(problem.hand, start, contacts, problem.world, steps=steps)
     certificate, status = problem.certificate[seeds.row], torch.full_like(seeds.row, Status.OK)
@@ -105,14 +108,14 @@ def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERA
 
 
 def try_best_seeds(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Attempts[Grasps]:
-    """Return attempts with the first two seeds of each row."""
+    """Return the results of refining the first two seeds of each contact set."""
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_in_group(seeds.row), (2,), partial(refine_on_contacts, problem, steps=steps))
     return attempts
 
 
 def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
-    """Return the sum of each seed's squared residuals [mm2], before any step."""
+    """Return the sum of squared residuals [mm2] of each seed before any refinement."""
     costs = [seeds.energy[:0]]
     for rows in torch.arange(len(seeds), device=seeds.row.device).split(256):  # their temporaries stay in the cache
         part = seeds[rows]
@@ -124,13 +127,13 @@ def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
 
 
 def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return each seed's rank within its row, by `seed_costs`."""
+    """Return the rank of each seed among the seeds of its contact set, by `seed_costs`."""
     return rank_in_group(seeds.row, seed_costs(problem, seeds))
 
 
 @checked
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp on fixed contacts for each row with seeds, best first; six seeds of a row are tried."""
+    """Return a checked grasp on fixed contacts for each contact set with seeds, best first; six seeds are tried."""
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_seeds(problem, seeds), (2, 4), partial(refine_on_contacts, problem))
@@ -140,7 +143,7 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 def refine_by_cobyla(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Return the configurations at which COBYLA stops; only the joints of the starts are used."""
+    """Return the configurations at which COBYLA stops; only the joints of the initial configurations are used."""
     if not len(configuration):
         return configuration
     rows = [CobylaRun(hand, q, p, world).solve() for q, p in zip(configuration.joints, contacts.points, strict=True)]
@@ -148,7 +151,7 @@ def refine_by_cobyla(
 
 
 class CobylaRun:
-    """One run from `joints` onto three points. SciPy asks for distance and clearances in turn, so values are kept."""
+    """One run of COBYLA from initial `joints` onto three contact points; the last values are cached for SciPy."""
 
     def __init__(self, hand: Hand, joints: Float[Tensor, "h"], points: Float[Tensor, "3 3"], world: CollisionWorld):
         self.hand, self.world = hand, world
@@ -159,7 +162,7 @@ class CobylaRun:
         self.last: tuple[bytes, float, np.ndarray] | None = None
 
     def place(self, x: np.ndarray) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
-        """Return joints within their limits, the links' frames in the hand, the pose by Eq. (24), whether it exists."""
+        """Return joints within limits, link frames in the hand, the pose of Eq. (24), and whether the pose exists."""
         step = ANGLE * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
         joints = (self.first + step).clamp(self.hand.lower.to(step), self.hand.upper.to(step))
         frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())
@@ -169,11 +172,11 @@ class CobylaRun:
         return joints, frames, virtual_frame(self.points) @ inverse(virtual_frame(tips)), True
 
     def tips(self, frames: Float[Tensor, "3 4 l 1"]) -> Float[Tensor, "3 3"]:
-        """Return the contact points of the fingertips in the hand [m]."""
+        """Return the contact points [m] of the fingertips in the hand's frame."""
         return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.contact)[..., 0].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of the tip distances, and the clearances less half a millimetre, which must be >= 0 [mm]."""
+        """Return the sum of tip distances from contacts [mm], and the constraints >= 0: clearances less 0.5 mm."""
         key = np.asarray(x).tobytes()
         if self.last is None or self.last[0] != key:
             _, frames, pose, framed = self.place(x)
@@ -183,7 +186,7 @@ class CobylaRun:
         return self.last[1:]
 
     def clearances(self, frames: Float[Tensor, "3 4 l 1"], pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, ""]]:
-        """Return clearances [m]: links from each other; palm, fingers, and tips from the object; all from the rest."""
+        """Return clearances [m]: between links; of palm, fingers and tips from the object; from table and obstacles."""
         spheres, radius = self.hand.collision_spheres, self.hand.collision_spheres.radius.to(pose)
         local = map_points(frames.index_select(2, spheres.link_index), spheres.center)[..., 0].T
         centres = apply(pose, local)
@@ -199,7 +202,7 @@ class CobylaRun:
         return found
 
     def solve(self) -> Configuration:
-        """Return the configuration where COBYLA stops; `DegenerateContacts` for contacts in a line."""
+        """Return the configuration at which COBYLA stops; raises `DegenerateContacts` for contacts on a line."""
         from scipy.optimize import NonlinearConstraint, minimize
 
         first = self.first.cpu().numpy()
@@ -218,9 +221,9 @@ class CobylaRun:
 
 
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp for each triple that was tried, best first.
+    """Return the paper's grasps: a checked grasp for each contact set that was tried, best first.
 
-    Triples are tried five at a time, two seeds each, until 10 are executable or 30 were tried.
+    Contact sets are tried five at a time, with two seeds each, until 10 are executable or 30 were tried.
     """
     seeds = problem.drop_unreachable(seeds)
     attempts, rows = Attempts(torch.ones_like(problem.certificate.closed), executable), seeds.row.unique()
@@ -242,7 +245,7 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
 
 def _rank(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return the rank of each seed among the seeds of its triple, by the depth of the deepest collision."""
+    """Return the rank of each seed among the seeds of its contact set, by the depth of its deepest collision."""
     contacts, still = assign(problem.contacts, seeds), np.zeros(problem.hand.dof)
     runs = [CobylaRun(problem.hand, q, p, problem.world) for q, p in zip(seeds.joints, contacts.points, strict=True)]
     deepest = [max(0.0, -float(run.evaluate(still)[1].min())) for run in runs]

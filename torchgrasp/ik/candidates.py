@@ -1,4 +1,4 @@
-"""What grasp solvers are given, and the checks that turn candidates into grasps; errors are measured by geometry."""
+"""The input of the grasp solvers, and the geometric checks that turn candidate configurations into grasps."""
 
 import dataclasses
 import math
@@ -34,9 +34,10 @@ ANGLE_TOLERANCE = math.radians(2)  # largest angle [rad] of a contact direction 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """A hand, certified contacts and the world. Grasps around `center`, the object's centre [m], rank higher.
+    """The input of a grasp solver: a hand, certified contact sets and the collision world.
 
-    Only poses that `reachable` accepts are grasps; None: every pose is reachable.
+    Grasps around `center`, the object's centre [m], score higher. `reachable` says which hand poses an arm can reach;
+    None: every pose.
 
     Raises:
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.
@@ -62,12 +63,11 @@ class GraspProblem(Value):
     reachable: Reachable | None = None
 
     def __post_init__(self) -> None:
-        """Check the contacts once, before any work."""
         self.contacts.require_std()
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
-        """Return the seeds with reachable poses."""
+        """Return the seeds whose poses are reachable."""
         return seeds if self.reachable is None else seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]
 
 
@@ -91,7 +91,7 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Configurations with finger i on contact i, a row's `permutation[:, i]`; `status` is that of the contacts."""
+    """Candidate configurations in which finger i touches contact `permutation[:, i]` of its contact set."""
 
     configuration: Annotated[Configuration, Rows("g")]
     contacts: Annotated[Contacts, Rows("g")]
@@ -103,7 +103,7 @@ class GraspCandidates(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
-    """Errors of grasps; `Grasps` explains the fields."""
+    """Geometric errors of grasps; see the fields of `Grasps`."""
 
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
     normal_angle: Annotated[Float[Tensor, "g f"], ANY]
@@ -120,10 +120,11 @@ def measure_errors(
     rolling: bool = True,
     tolerance: Length = TIP_TOLERANCE,
 ) -> GraspErrors:
-    """Measure grasps; `status` names the first error out of tolerance, NaN included.
+    """Measure geometric errors of grasps; `status` is the first error out of tolerance, NaN included.
 
-    Round fingertips may roll on their contacts within the pads' cones. If not `rolling`, the contact points of the pads
-    are measured, in any direction, as in the paper. `tolerance` [m] is the tolerance of tips.
+    With `rolling`, round fingertips may roll on their contacts within the cones of their pads. Without, as in the
+    paper, the contact points of the pads are measured and their direction is free. `tolerance` [m] limits a tip's
+    distance from its contact.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     touching, target = (
@@ -152,7 +153,7 @@ def measure_errors(
 
 
 def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Return which hands touch neither object nor table nor themselves, not even with their fingertips."""
+    """Return which hands touch neither object nor table nor themselves, fingertips included."""
     links, _, table = link_clearance(SpatialJacobian.at(hand, configuration), world, tips_touch=False)
     return (links >= 0) & (table >= 0) & (hand.self_clearance(configuration.joints) >= 0)
 
@@ -161,7 +162,7 @@ def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) ->
 def check_candidates(
     problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
 ) -> Grasps:
-    """Return checked grasps (`measure_errors`); grasps without an error get a pre-grasp and an approach."""
+    """Return checked grasps (`measure_errors`); faultless grasps also get a pre-grasp and an approach direction."""
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed
@@ -203,7 +204,7 @@ def check_candidates(
 def _keep_clear(
     problem: GraspProblem, configuration: Configuration, opened: Configuration, approach: Tensor, status: Tensor
 ) -> None:
-    """Mark in place the grasps that obstacles prevent; obstacles that may be touched only change the approach."""
+    """Set in place the status of grasps that collide with obstacles; soft obstacles only change the approach."""
     hand, world = problem.hand, problem.world
     crowded = torch.nonzero(status == Status.NO_APPROACH)[:, 0]
     direction, clearance = find_approach(hand, opened[crowded], world.alone)

@@ -1,4 +1,4 @@
-"""What links must not touch, and their clearances: from the object, the table, obstacles and each other."""
+"""The collision world, and clearances of a hand's links: from object, table, obstacles and each other."""
 
 import dataclasses
 import math
@@ -28,13 +28,13 @@ HINGES = 8  # number of least clearances of each kind that enter one step
 @checked
 @dataclasses.dataclass(frozen=True)
 class Obstacles(Value):
-    """Regions of a scene that are full with increasing probability, as distances [m] from them.
+    """Regions of a scene that are occupied with a given probability, as distance fields [m].
 
     Args:
-        field: signed distances from the region that counts as full.
+        field: signed distances from the region that counts as occupied.
         distances: unsigned distances from the regions of at least each of the `levels`, on the same grid.
         levels: probabilities, ascending.
-        hard: whether links must not touch the full region; otherwise contact only lowers the predicted success.
+        hard: whether links must not touch the occupied region; otherwise a collision only lowers the predicted success.
 
     >>> from torchgrasp import load_scene
     >>> from torchgrasp.scene import estimate_occupancy
@@ -53,7 +53,7 @@ class Obstacles(Value):
     @classmethod
     @checked
     def of(cls, occupancy: Occupancy, full: float = 0.3, hard: bool = True) -> "Obstacles | None":
-        """Return the obstacles of an occupancy; voxels of probability `full` or more count as full. None: all is free.
+        """Return the obstacles of an occupancy grid; None if the whole grid is free.
 
         Raises:
             BadArgument: `full` outside [0.01, 1].
@@ -70,7 +70,7 @@ class Obstacles(Value):
 
     @checked(gradients=True)
     def likelihood(self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]) -> Float[Tensor, "*b"]:
-        """Return the largest probability of the regions that spheres [m] meet, as the middle between two levels."""
+        """Return, for each set of spheres [m], the largest occupancy probability of the regions that they touch."""
         met = centres.new_zeros(centres.shape[:-2])
         levels = [*self.levels.tolist(), 1.0]
         for low, high, values in zip(levels, levels[1:], self.distances, strict=False):
@@ -80,7 +80,7 @@ class Obstacles(Value):
 
 
 def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
-    """Return the distances [m] of voxels from the faces of a region, 0 inside; an empty one is out of the grid."""
+    """Return the distance [m] of each voxel from a region; 0 inside, larger than the grid for an empty region."""
     from scipy.ndimage import distance_transform_edt
 
     if not bool(region.any()):
@@ -90,7 +90,7 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 
 
 def depth_in(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
-    """Return how deep [m] voxels lie in a region, 0 outside."""
+    """Return the depth [m] of each voxel inside a region; 0 outside."""
     depth = torch.zeros(region.shape, dtype=torch.float64)
     if bool(region.any()):
         where = torch.nonzero(region)  # only the box of the region is transformed
@@ -103,10 +103,10 @@ def depth_in(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The object's signed distance field, the table as a plane or a height [m] along z, and obstacles, if any.
+    """What the hand must not touch: the object as a signed distance field, a table, and obstacles; each may be None.
 
     Raises:
-        BadArgument: a table that is neither.
+        BadArgument: a table that is neither a plane nor a height.
 
     >>> CollisionWorld(table=0.02).plane.offset
     0.02
@@ -117,7 +117,6 @@ class CollisionWorld(Value):
     obstacles: Obstacles | None = None
 
     def __post_init__(self) -> None:
-        """Check the table once, where the value is made."""
         as_plane(self.table)
 
     @cached_property
@@ -153,7 +152,7 @@ def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
-    """Return the squared clearance deficits [mm2] of a touching hand."""
+    """Return the sum of squared missing clearances [mm2] of a hand whose fingertips may touch the object."""
     radius, cost = spheres.radius.to(centres), centres.new_zeros(centres.shape[:-2])
     if world.field is not None:
         deficit = (CLEARANCE + radius - world.field.nearest_node(centres)) * ~spheres.touching
@@ -168,12 +167,12 @@ def collision_cost(
 
 
 def clearance_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
-    """Return hinges on the least clearances of the links from each other, the object, obstacles and the table."""
+    """Return residuals for the smallest clearances: between links, from object, obstacles and table."""
     return [self_rows(spatial), *sphere_rows(spatial, world, tips_touch)]
 
 
 def self_rows(spatial: SpatialJacobian) -> Rows:
-    """Return hinges on the links' least clearances from each other."""
+    """Return residuals for the smallest clearances between the hand's links."""
     pairs, moves = spatial.hand.self_collision, spatial.hand.motion.moves
     separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
     separation, index = separation.T.topk(min(HINGES, len(pairs.pairs)), dim=1, largest=False, sorted=False)
@@ -183,7 +182,7 @@ def self_rows(spatial: SpatialJacobian) -> Rows:
 
 
 def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
-    """Return hinges on the least clearances of the links' spheres from each of object, obstacles and table."""
+    """Return residuals for the smallest clearances of the links' spheres from object, obstacles and table."""
     spheres, motion, centres = spatial.hand.collision_spheres, spatial.hand.motion, spatial.sphere_centres
     radius, found = spheres.radius.to(centres), []
     for field in world.fields:
@@ -218,7 +217,7 @@ def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: boo
 def link_clearance(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
-    """Return the least clearances [m]: links (no touching tips) from object, tips from object, all from table."""
+    """Return least clearances [m]: links from the object, touching tips from the object, all from the table."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres
     radius = spheres.radius.to(centres)
@@ -233,7 +232,7 @@ def link_clearance(
 
 
 def obstacle_clearance(spatial: SpatialJacobian, world: CollisionWorld) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of all links, fingertips too, from obstacles; infinite without any."""
+    """Return the least clearance [m] of all links, fingertips included, from obstacles; infinite without obstacles."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres
     if world.obstacles is None:

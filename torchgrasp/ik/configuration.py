@@ -1,7 +1,7 @@
-"""Configurations of a free hand, and Jacobians of points on it.
+"""Configurations of a free-floating hand, and Jacobians of points on its links.
 
-A row of a Jacobian is the virtual work of a force at a point: a wrench about the object's origin. Its derivative by a
-motion is the wrench times the motion's twist.
+A Jacobian is built from wrenches: the derivative of a residual by a joint or pose motion is the product of a wrench
+about the object's origin and the twist of the motion.
 """
 
 import dataclasses
@@ -24,14 +24,17 @@ from torchgrasp.hand.kinematics import map_points
 @checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
-    """Joints [rad] and pose of a free hand."""
+    """Joints [rad] and pose of a free-floating hand."""
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Poses
 
     @checked(gradients=True)
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "Configuration":
-        """Step by a translation [m], a rotation vector (both in the hand's axes) and joints, clamped to the limits."""
+        """Return the configuration after a step of translation [m], rotation vector and joints, within the limits.
+
+        Translation and rotation vector are in the hand's axes.
+        """
         if step.shape[1] != 6 + self.joints.shape[1]:
             raise BadArgument("step", f"{step.shape[1]} numbers", f"6 of the pose and {self.joints.shape[1]} joints")
         rotation, position = self.obj_from_hand[:, :3, :3], self.obj_from_hand[:, :3, 3]
@@ -41,7 +44,7 @@ class Configuration(Batch):
 
 
 class Rows(NamedTuple):
-    """Residuals, and how a hand's motions change them: by the work of `wrench` where `moves` is 1."""
+    """Residuals with their derivatives: `wrench` times the twist of each motion for which `moves` is 1."""
 
     residual: Float[Tensor, "g k"]
     wrench: Float[Tensor, "g k 6"]
@@ -50,7 +53,7 @@ class Rows(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """Frames of the links, the markers and the twists of its motions, in the object's frame."""
+    """Link frames, sphere centres, fingertips, pad axes and motion twists of a hand, in the object's frame."""
 
     hand: Hand
     obj_from_link: Float[Tensor, "3 4 l g"]
@@ -61,7 +64,7 @@ class SpatialJacobian(Value):
 
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
-        """Return the frames and axes from which Jacobians at configurations follow, by one call of the kinematics."""
+        """Evaluate the kinematics at configurations; Jacobians follow from the result."""
         root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
         frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
         spheres, tips, pads, origins, turning, sliding = hand.motion.place(frames)
@@ -69,7 +72,7 @@ class SpatialJacobian(Value):
         return cls(hand, frames, spheres, tips, pads, twists)
 
     def points(self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]) -> Float[Tensor, "g k 3"]:
-        """Return points fixed in links, in the object's frame [m]."""
+        """Return points [m] that are fixed in links, in the object's frame."""
         return map_points(self.obj_from_link.index_select(2, links), local).permute(2, 1, 0)
 
     @property
@@ -78,13 +81,13 @@ class SpatialJacobian(Value):
         return self.spheres.permute(2, 1, 0)
 
     def jacobian(self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of rows (`Rows`) by pose and joints."""
+        """Return the derivatives of residuals by pose and joints; the arguments are fields of `Rows`."""
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling
         return by_motion if coupling is None else by_motion @ coupling.to(by_motion)
 
 
 def differentiate(spatial: SpatialJacobian, parts: Sequence[Rows]) -> Residuals:
-    """Return the residuals of all parts, one after the other, and their Jacobian by pose and joints."""
+    """Return the residuals of all parts, concatenated, and their Jacobian by pose and joints."""
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     return residual, spatial.jacobian(wrench, moves)

@@ -1,7 +1,7 @@
-"""Contacts, pose and joints solved together: the contacts slide until the hand reaches them.
+"""Contacts, hand pose and joints solved together: the contacts slide on the surface until the hand reaches them.
 
-The contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals are one least-squares
-problem. Its unknowns are pose, joints, contacts and tensions.
+The contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals form one least-squares
+problem. Its unknowns are pose, joints, contact points and tensions between contacts.
 """
 
 import dataclasses
@@ -35,9 +35,9 @@ CONTACT_WEIGHT = 2.0
 
 
 class Stage(NamedTuple):
-    """A number of steps, whether the surface must be flat, and the cost [mm2] above which a row is dropped.
+    """A solver stage: number of steps, whether flatness is required, and the cost [mm2] above which a grasp is dropped.
 
-    The constraint of flatness is linearised when the stage begins.
+    The flatness constraint is linearised at the start of the stage.
     """
 
     steps: int
@@ -51,9 +51,9 @@ STAGES = (Stage(5, False, 1e5), Stage(6, True, 1e4), Stage(7, True, 500.0), Stag
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """Hands, their normalised contacts, and the tensions of the balance (`forces_from_tensions`).
+    """Hand configurations, their contact points (normalised), and the tensions between contacts.
 
-    The variance at the contacts is extrapolated linearly from the begin of a stage.
+    The variance at the contacts is extrapolated linearly from the start of a stage.
     """
 
     configuration: Configuration
@@ -74,7 +74,7 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """A hand and its object, with contacts that satisfy `spec`."""
+    """The joint problem of one hand, object and collision world, with contacts that satisfy `spec`."""
 
     hand: Hand
     shape: Shape
@@ -83,11 +83,11 @@ class JointProblem:
 
     @cached_property
     def contact_problem(self) -> ContactProblem:
-        """The problem of the contacts alone."""
+        """The contact planning problem, without the hand."""
         return ContactProblem.of(self.shape, self.spec)
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
-        """Return the residuals [mm], and their Jacobian by all unknowns."""
+        """Return all residuals [mm], and their Jacobian by all unknowns."""
         hand, shape = self.hand, self.shape
         jet = with_variance(triple_mean_jet(shape, state.points), state.variance, state.variance_gradient)
         spatial = SpatialJacobian.at(hand, state.configuration)
@@ -107,7 +107,7 @@ class JointProblem:
     def _tips_by_points(
         self, spatial: SpatialJacobian, jet: SurfaceJet, outside: Bool[Tensor, "g f"]
     ) -> Float[Tensor, "g 4*f 3*f"]:
-        """Return the derivative of the tip residuals by the contacts; pads count only `outside` their cones."""
+        """Return the Jacobian of the fingertip residuals by the contact points; pads count only `outside` cones."""
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity, own = (torch.eye(k, dtype=normals.dtype, device=normals.device) for k in (3, len(hand.tips)))
         target = float(self.shape.scale) * identity + hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
@@ -118,7 +118,7 @@ class JointProblem:
         return torch.cat([-TIP_WEIGHT / MILLIMETRE * tips, PAD_WEIGHT * tilts], 1)
 
     def _contact_residuals(self, state: JointState, jet: SurfaceJet, flat: FlatnessConstraint | None) -> Residuals:
-        """Return residuals [mm] of the contact problem, zero where bounds hold."""
+        """Return the residuals [mm] of the contact problem; zero where a bound is satisfied."""
         rows = self.contact_problem.constraints(state.points, state.tension, jet)
         bounds, bounds_by_x = rows.bounds, rows.bounds_by_x
         if flat is not None:
@@ -134,9 +134,9 @@ class JointProblem:
     def solve(
         self, configuration: Configuration, points: Float[Tensor, "g f 3"]
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
-        """Return hands and contacts that satisfy all constraints, as far as each row allows.
+        """Return hand configurations and contacts that satisfy all constraints as far as possible.
 
-        Contacts are normalised. Rows of high cost are dropped; the last result holds the numbers of the kept rows.
+        Contacts are normalised. Grasps of high cost are dropped; the last result gives the indices of the others.
         """
         largest, radius = self.spec.flatness, self.spec.ring_radius
         rows, tension = torch.arange(len(points), device=points.device), equal_tensions(points)
@@ -162,7 +162,7 @@ class JointProblem:
 def solve_sliding(
     problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec, attempts: Attempts[Grasps]
 ) -> None:
-    """Add attempts with sliding contacts for each unsolved row."""
+    """Add results with sliding contacts to `attempts`, for each unsolved contact set."""
     joint_problem = JointProblem(problem.hand, shape, spec, problem.world)
     count = 8 if len(problem.hand.tips) == 3 else 2
     chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, count)
@@ -179,9 +179,10 @@ def solve_sliding(
 
 @checked
 def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
-    """Return a checked grasp for each row with seeds, best first; contacts slide if the hand misses fixed contacts.
+    """Return a checked grasp for each contact set with seeds, best first; contacts slide if the hand misses them.
 
-    Seeds are tried in their order. Contacts that slid are certified again; their failures have a planning `Status`.
+    Seeds are tried in their order. Contacts that have slid are certified anew; if they fail, the grasp has the `Status`
+    of the contact planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import PostureLibrary

@@ -1,4 +1,4 @@
-"""The motion of a grasp: the straight approach of the opened hand, the closing and the lift."""
+"""Clearance of a grasp's motion: the straight approach of the opened hand, the closing and the lift."""
 
 import math
 
@@ -22,10 +22,11 @@ COARSE_STEPS, FINE_STEPS = 8, 16  # positions on each candidate path, and on a c
 def find_approach(
     hand: Hand, opened: Configuration, world: CollisionWorld
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
-    """Return a direction of approach for each pre-grasp, and the least clearance [m] of its path.
+    """Return an approach direction for each pre-grasp, and the least clearance [m] along its path.
 
-    Candidates are the hand's approach axis, tilted directions and, above a table, straight down. The nearest nodes of
-    the field rank the paths. The first path of non-negative interpolated clearance is taken, or else the clearest path.
+    Candidates are the hand's approach axis, directions tilted from it and, above a table, straight down. They are
+    sorted by approximate clearance, from the nearest nodes of the distance field. The first path without a collision is
+    chosen, or else the path of greatest clearance.
     """
     spheres = hand.collision_spheres
     centres = SpatialJacobian.at(hand, opened).sphere_centres
@@ -42,7 +43,7 @@ def find_approach(
 
 
 def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) -> Float[Tensor, "g k 3"]:
-    """Return the candidate directions in the object's frame."""
+    """Return the candidate approach directions in the object's frame."""
     pose = opened.obj_from_hand
     axis = unit(hand.approach.to(pose))
     first = unit(torch.linalg.cross(axis, torch.eye(3).to(axis)[axis.abs().argmin()]))
@@ -64,7 +65,7 @@ def _clearance(
     world: CollisionWorld,
     exact: bool,
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of spheres along a path to the pre-grasp, interpolated or by the nearest nodes."""
+    """Return the least clearance [m] of spheres on a straight path to the pre-grasp, `exact` or by nearest nodes."""
     steps = FINE_STEPS if exact else COARSE_STEPS
     back = torch.arange(1, steps + 1, dtype=centres.dtype, device=centres.device) * (APPROACH_DISTANCE / steps)
     path = (centres[:, None] - back[:, None, None] * direction[:, None, None]).flatten(1, 2)
@@ -85,7 +86,7 @@ def _clearance(
 def motion_clearance(
     hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"], world: CollisionWorld
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of closing and lifting hands from obstacles."""
+    """Return the least clearance [m] from obstacles while the hand closes and lifts."""
     assert world.obstacles is not None
     up = torch.tensor([0.0, 0.0, 1.0]) if world.plane is None else world.plane.normal
     centres = torch.cat([_closing(hand, configuration, pregrasp), _lift(hand, configuration, up)], 1)
@@ -96,10 +97,10 @@ def motion_clearance(
 def collision_probability(
     hand: Hand, grasps: Grasps, obstacles: Obstacles, up: Float[Tensor, "3"] | None = None
 ) -> Float[Tensor, "g"]:
-    """Return the probability of a collision of each hand on its approach, while it closes, and on its lift.
+    """Return the probability that the hand collides during approach, closing and lift.
 
-    The unseen extent of one object decides whether its hidden voxels are full, so they are full or free together.
-    Therefore the largest probability among the swept voxels counts. `up` is the direction of the lift; None: z.
+    Hidden voxels behind one object are occupied or free together, so the largest probability among the swept voxels
+    counts. `up` is the direction of the lift; None: z.
     """
     up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
     configuration = Configuration(grasps.joints, grasps.obj_from_hand)
@@ -115,29 +116,29 @@ def collision_probability(
 
 @checked
 def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles, up: Float[Tensor, "3"] | None = None) -> float:
-    """Return the clearance [m] of a lifted surface from obstacles: far below zero if an object lies on it."""
+    """Return the clearance [m] of the object's lifted surface from obstacles; far below 0 if one lies on it."""
     up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
     return float(obstacles.field.query(_lifted(vertices, up))[0].min()) if len(vertices) else math.inf
 
 
 def _closing(hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"]) -> Float[Tensor, "g k s 3"]:
-    """Return the spheres' centres [m] while the hand closes, at its pre-grasp and its grasp too."""
+    """Return the sphere centres [m] at k postures from pre-grasp to grasp."""
     shares = torch.linspace(0, 1, 6).tolist()
     postures = [torch.lerp(pregrasp, configuration.joints, share) for share in shares]
     return torch.stack([_centres(hand, Configuration(x, configuration.obj_from_hand)) for x in postures], 1)
 
 
 def _lift(hand: Hand, configuration: Configuration, up: Float[Tensor, "3"]) -> Float[Tensor, "g k s 3"]:
-    """Return the spheres' centres [m] while the hand is lifted."""
+    """Return the sphere centres [m] at k heights while the hand is lifted."""
     return _lifted(_centres(hand, configuration), up).movedim(0, 1)
 
 
 def _lifted(points: Float[Tensor, "*b 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "k *b 3"]:
-    """Return points [m] at six heights of a lift of 0.1 m."""
+    """Return points [m] at six heights of a 0.1 m lift."""
     height = torch.arange(1, 7).to(points) * (0.1 / 6)
     return points + (height[:, None] * up.to(points)).reshape(-1, *[1] * (points.ndim - 1), 3)
 
 
 def _centres(hand: Hand, configuration: Configuration) -> Float[Tensor, "g s 3"]:
-    """Return the centres [m] of the hand's spheres."""
+    """Return the centres [m] of the hand's collision spheres in the object's frame."""
     return SpatialJacobian.at(hand, configuration).sphere_centres

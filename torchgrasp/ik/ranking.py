@@ -1,7 +1,7 @@
 """The order of grasps: a geometric score of candidates, and a predicted probability of success.
 
-`score` chooses among the candidates of one row of contacts. A logistic model orders executable grasps; it is fitted by
-`scripts/train.py success` to trials of the Allegro and the Barrett hand with three fingertips.
+`score` chooses among the candidates of one contact set. A logistic model of success orders executable grasps;
+`scripts/train.py success` fits it to trials of the Allegro and the Barrett hand with three fingertips.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ MODEL = Path(__file__).with_name("success.json")
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the order of rows by the first key, ties by the next."""
+    """Return the indices that sort rows by the first key, ties by the next key."""
     order = torch.argsort(keys[-1], stable=True)
     for key in reversed(keys[:-1]):
         order = order[torch.argsort(key[order], stable=True)]
@@ -53,7 +53,7 @@ def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the friction that forces towards the centre of the contacts need: the largest over the contacts."""
+    """Return the friction needed by forces towards the contacts' centroid: the largest over the contacts."""
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
     sine = torch.linalg.vector_norm(torch.linalg.cross(inward, contacts.normals), dim=-1)
@@ -61,16 +61,19 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
 
 
 def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
-    """Return scores: a point is lost by 20 mm off the centre, by a unit of friction, or by 0.8 rad off the pads."""
+    """Return the geometric score of grasps, at most 0; higher is better.
+
+    One point is lost by 20 mm between the centroid and `center`, by a unit of friction, or by 0.8 rad off the pads.
+    """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(offset / 0.02 + centred_friction(contacts) + normal_angle.amax(1) / 0.8)
 
 
 def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
-    """Return the arm of a load at `center` about the longest side of each triangle, over the triangle's height.
+    """Return the lever arm of a load at `center` about the longest side of the contacts' triangle, over its height.
 
-    The object turns most easily about this side: only the third contact resists, by a lever of the height, and torsion,
-    by a lever of 10 mm. More than three contacts count as their best three.
+    The object turns most easily about this side: only the third contact resists, by a lever of the triangle's height,
+    and torsion, by a lever of 10 mm. For more than three contacts the best three count.
     """
     if points.shape[1] > 3:
         triples = torch.tensor(list(itertools.combinations(range(points.shape[1]), 3)), device=points.device)
@@ -85,7 +88,7 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
 
 
 def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
-    """Return the lever [m] of each finger's joints about its contact's normal: the norm of their moment arms.
+    """Return the lever [m] of each finger's joints about the normal of its contact: the norm of their moment arms.
 
     Joints of stiffness k yield by lever^2 / k under a unit force along the normal. If the surface is off by e, the
     force of the finger is off by k e / lever^2. A finger that points along its normal has no lever.
@@ -100,15 +103,15 @@ def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
 def success_features(
     hand: Hand, shape: ShapeGP, grasps: Grasps, center: Float[Tensor, "3"], friction: float, seed: int = 0
 ) -> Float[Tensor, "g k"]:
-    """Return `FEATURES` of each grasp.
+    """Return the `FEATURES` of each grasp, input of the success model.
 
     Args:
         hand: the hand; it follows the grasps to their device.
-        shape: the posterior.
+        shape: the uncertain shape.
         grasps: planned grasps on its surface.
-        center: of the object's mass, as far as known [m].
-        friction: of fingertips and object.
-        seed: of the surfaces that are drawn.
+        center: estimated centre of mass of the object [m].
+        friction: friction coefficient between fingertips and object.
+        seed: random seed.
     """
     contacts = grasps.contacts
     points, normals = contacts.points.to(shape.x), contacts.normals.to(shape.x)
@@ -143,7 +146,7 @@ def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:
 
 
 def rank_by_variance(grasps: Grasps) -> Grasps:
-    """Return executable grasps first, the least sum of the contacts' variances first (Sec. 6.5); scores are unchanged.
+    """Sort grasps: executable grasps first, by increasing sum of the contacts' variances (Sec. 6.5).
 
     Raises:
         BadArgument: contacts without `variance`.

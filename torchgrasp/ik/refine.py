@@ -1,7 +1,7 @@
-"""Move hands onto their contacts and away from everything else, by batched Levenberg-Marquardt on pose and joints.
+"""Refinement of hand configurations onto contacts and away from collisions, by batched Levenberg-Marquardt.
 
-The centre of a round fingertip is one radius off its contact, so the tip may roll. Other tips touch with their contact
-points. The contact direction stays inside a cone about the pad's axis.
+The centre of a round fingertip is one radius away from its contact, so that the tip may roll. Other tips touch with
+their contact points. The contact direction stays inside a cone about the pad's axis.
 """
 
 import torch
@@ -21,12 +21,12 @@ ITERATIONS = 30  # most steps of one refinement
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
-    """Return the centres [m] (`Hand.tip_centres`) of touching tips."""
+    """Return where the fingertip centres [m] (`Hand.tip_centres`) must be to touch their contacts."""
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
 
 def tip_rows(spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]) -> Rows:
-    """Return the residuals of the tips' centres, three to a tip, then of the contact directions."""
+    """Return the residuals of fingertips: three of each tip's position, then one of each contact direction."""
     tips, motion, g = spatial.hand.tips, spatial.hand.motion, len(target)
     centres, pads = spatial.tips.permute(2, 1, 0), spatial.pads.permute(2, 1, 0)
     outside = tips.cone.cos().to(pads) + (pads * normals).sum(-1)  # the contact direction is the inward normal
@@ -48,7 +48,7 @@ def grasp_residuals(
     world: CollisionWorld | None,
     tips_touch: bool,
 ) -> Residuals:
-    """Return the residuals of tips, pads and, in a world, clearances."""
+    """Return the residuals of fingertip positions, pad directions and, if there is a world, clearances."""
     spatial = SpatialJacobian.at(hand, configuration)
     links = [] if world is None else clearance_rows(spatial, world, tips_touch)
     return differentiate(spatial, [tip_rows(spatial, target, normals), *links])
@@ -62,9 +62,10 @@ def refine(
     solved: float = SOLVED,
     steps: int = ITERATIONS,
 ) -> Configuration:
-    """Return configurations with finger i on contact i and clear links, as far as possible.
+    """Return configurations in which finger i touches contact i and links are clear, as far as possible.
 
-    A row is done when its squared residuals [mm2] sum to less than `solved`. Without a world, links may collide.
+    A configuration is done when its sum of squared residuals [mm2] is below `solved`. Without a world no collision is
+    avoided.
     """
     target, normals = tip_targets(hand, contacts), contacts.normals
 
@@ -78,9 +79,9 @@ def refine(
 def open_hand(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Float[Tensor, "g h"]:
-    """Return the joints of the pre-grasp: each tip is off its contact along the normal, and every link is clear.
+    """Return the joints of the pre-grasp: each tip is moved off its contact along the normal, and every link is clear.
 
-    The pose is the same. The distance is 12 mm plus three standard deviations of the surface.
+    The pose is that of the grasp. The distance is 12 mm plus three standard deviations of the surface.
     """
     normals, gap = contacts.normals, 0.012 + 3.0 * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals

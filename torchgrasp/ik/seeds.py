@@ -1,6 +1,6 @@
-"""Seeds of the hand near contacts: the nearest of random postures, or configurations of the learned model.
+"""Initial guesses (seeds) of hand pose and joints near contacts, from random postures or the learned model.
 
-One matrix product compares the contacts of every row with thousands of postures. Clearances rank the nearest postures.
+One matrix product compares all contact sets with thousands of postures. Clearances rank the nearest postures.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ WRONG_SIDE = 0.3  # mean cosine of the outward normals of tips and contacts abov
 @checked
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """Postures of a hand, with tip `centres` [m] in the frames of `tips_frame`, `feature`s and collision `spheres`.
+    """Random postures of a hand, with fingertip centres [m] in their own frame (`tips_frame`), for quick comparison.
 
     >>> from torchgrasp import load_hand
     >>> library = PostureLibrary.of(load_hand("barrett"), count=200)
@@ -49,7 +49,7 @@ class PostureLibrary(Value):
     spheres: Float[Tensor, "s k 3"]
 
     def __post_init__(self) -> None:
-        """Refuse postures of another hand."""
+        """Check that the postures fit the hand."""
         f, spheres = len(self.hand.tips), len(self.hand.collision_spheres.radius)
         wanted = (self.hand.dof, f, 6 * f, spheres)
         found = tuple(x.shape[1] for x in (self.joints, self.centres, self.feature, self.spheres))
@@ -59,10 +59,7 @@ class PostureLibrary(Value):
     @classmethod
     @checked
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
-        """Draw postures within the joint limits and free of self-collision; more for more than three fingertips.
-
-        The last library is kept with the hand.
-        """
+        """Draw random postures within the joint limits and without self-collision; the hand caches the last library."""
         count = (5000 if len(hand.tips) == 3 else 20_000) if count is None else count
         found = hand.derived.get(PostureLibrary)
         if found is None or found[0] != (count, seed):
@@ -71,7 +68,7 @@ class PostureLibrary(Value):
 
     @classmethod
     def _drawn(cls, hand: Hand, count: int, seed: int) -> "PostureLibrary":
-        """Draw postures; see `of`."""
+        """Draw `count` random postures."""
         joints = sample_configurations(hand, count, seed).joints.to(hand.lower.device, torch.float64)
         joints = joints[~degenerate(triangle_of(hand.tip_centres(joints)))]
         centres, (_, pads) = hand.tip_centres(joints), hand.fingertips(joints)
@@ -81,7 +78,7 @@ class PostureLibrary(Value):
 
 
 def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the first point, the centre of the points between, and the last point, in the order of the fingers."""
+    """Return three of the points in finger order: the first, the centroid of the middle points, and the last."""
     if points.shape[-2] == 3:
         return points
     between = points[..., 1:-1, :].mean(-2, keepdim=True)
@@ -89,16 +86,16 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the frame of three to five points: the `virtual_frame` of their triangle, about the centre of all points.
+    """Return the frame of three to five points: axes of their triangle's `virtual_frame`, origin at their centroid.
 
     Raises:
-        DegenerateContacts: a triangle is too flat.
+        DegenerateContacts: the triangle is too flat.
     """
     return rigid(virtual_frame(triangle_of(points))[..., :3, :3], points.mean(-2))
 
 
 def feature(centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b d"]:
-    """Return tip centres and pad axes in units of their scales."""
+    """Return the feature vector of a posture: tip centres and pad axes, each divided by its scale."""
     return torch.cat([centres / LENGTH_SCALE, pads / COSINE_SCALE], -1).flatten(-2).float()
 
 
@@ -110,15 +107,14 @@ def nearest_postures(
     n_seeds: Count = 8,
     reachable: Reachable | None = None,
 ) -> IKSeeds:
-    """Return the postures nearest to contacts, placed by Eq. (24) with the tips' centres for fingertips.
+    """Return the library postures nearest to contact sets as seeds, each placed on the contacts by Eq. (24).
 
-    Seeds are in the order of the contacts' rows, best first within a row. A row without a `tips_frame` has no seeds.
-    `energy` is half the squared distance of the features. If `reachable` refuses a pose, the next posture takes its
-    place.
+    Seeds are in the order of the contact sets, best first within a set. Degenerate contact sets have no seeds. `energy`
+    is half the squared distance of the features. If a pose is not `reachable`, the next posture takes its place.
 
     Raises:
-        BadArgument: `n_seeds`, for each row, is not in [1, 64], or above six times the number of postures; contacts on
-            another device than the library, or of another number than its fingertips.
+        BadArgument: `n_seeds`, for each contact set, is not in [1, 64], or above six times the number of postures;
+            contacts on another device than the library, or of another number than its fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -170,7 +166,7 @@ def nearest_postures(
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
 ) -> tuple[Float[Tensor, "r p 4 4"], Float[Tensor, "r p d"]]:
-    """Return virtual frame and features of the contacts in each assignment; arbitrary where not `framed`."""
+    """Return the virtual frame and features of contacts for each assignment to fingers; arbitrary if not `framed`."""
     stand_in = torch.eye(3, dtype=centres.dtype, device=centres.device)
     triangle = torch.where(framed[..., None, None], triangle_of(centres), stand_in)
     obj_from_vf = rigid(virtual_frame(triangle)[..., :3, :3], centres.mean(-2))
@@ -181,7 +177,7 @@ def _describe(
 def _energies(
     wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
 ) -> Float[Tensor, "r p s"]:
-    """Return half the squared distances of features from the features of postures, infinite without a frame."""
+    """Return half the squared distance between features of contacts and postures; infinite where not `framed`."""
     energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
     return torch.where(framed[..., None], energy, torch.inf)
 
@@ -189,7 +185,7 @@ def _energies(
 def _likely_assignments(
     wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
 ) -> Int[Tensor, "r a"]:
-    """Return the assignments of each row that are nearest to one of the first 500 postures."""
+    """Return the assignments of contacts to fingers whose features come closest to the first 500 postures."""
     if wanted.shape[1] <= ASSIGNMENTS:
         return torch.arange(wanted.shape[1], device=wanted.device).expand(len(wanted), -1)
     nearest = _energies(wanted, given[:500], framed).amin(-1)
@@ -200,17 +196,17 @@ def _likely_assignments(
 def query_mixture(
     hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: Count = 8, max_energy: Positive = DEFAULT_ENERGY
 ) -> IKSeeds:
-    """Return the learned model's configurations near the contacts, in all six assignments (the paper's Eqs. 21-24).
+    """Return seeds near the contacts from the learned model, for all six assignments (Eqs. 21-24).
 
     For every assignment within reach (Eq. 21) the joints are the conditional mean (Eq. 23) and the means of the most
-    responsible components, clamped to the limits. Eq. (24) places the hand. Fingertips are still off by centimetres.
-    Seeds are in the order of the contacts' rows. Within a row, seeds on the right side of the surface come first, then
-    seeds of smaller tip error. An unreachable row has no seeds.
+    responsible components, clamped to the limits. Eq. (24) gives the pose. Fingertips are still centimetres away from
+    their contacts. Seeds are in the order of the contact sets; within a set, seeds on the right side of the surface
+    come first, then by tip error. An unreachable contact set has no seeds.
 
     Args:
-        contacts: triples on the object; hand and mixture are moved to their device.
+        contacts: contact sets (b, 3) on the object; hand and mixture are moved to their device.
         mixture: the hand's learned model.
-        n_seeds: for each assignment, at most one more than the mixture has components.
+        n_seeds: seeds for each assignment, at most one more than the mixture has components.
         max_energy: largest distance of a code from the nearest component, f_i of Eq. (21); the paper's: `PAPER_ENERGY`.
 
     Raises:
@@ -226,7 +222,7 @@ def query_mixture(
 
 
 def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, max_energy: float) -> IKSeeds:
-    """Return the seeds of some triples."""
+    """Return the seeds of a part of the contact sets."""
     code = encode((contacts.points.double(), contacts.normals.double()))
     energy = mixture.energy(code)
     row, assignment = torch.nonzero(energy < max_energy, as_tuple=True)  # NaN is not less

@@ -1,6 +1,6 @@
 """Inverse kinematics of given contacts: joints and pose of a hand that touches nothing else.
 
-Seeds of the learned model come first (Eqs. 21-24), then the nearest random postures.
+Seeds of the learned model are tried first (Eqs. 21-24), then the nearest random postures.
 """
 
 import dataclasses
@@ -35,10 +35,10 @@ EXACT = 1e-6  # sum of squared residuals [mm2] at which a seed is done
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSolution(Batch):
-    """A configuration for each row of contacts; finger i touches contact `permutation[:, i]`.
+    """A hand configuration for each contact set; finger i touches contact `permutation[:, i]`.
 
-    `clearance` [m] is the least clearance of the links; `attempts` counts the refined seeds. A row without seeds holds
-    NaN.
+    `clearance` [m] is the least clearance of the links; `attempts` counts the refined seeds. A contact set without
+    seeds gives NaN.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -67,17 +67,19 @@ def solve_ik(
     method: Method = "levenberg_marquardt",
     library: PostureLibrary | None = None,
 ) -> IKSolution:
-    """Return configurations that touch the contacts in any assignment, without self-collision.
+    """Return hand configurations that touch given contacts, in any assignment to fingers, without self-collision.
 
     Args:
-        contacts: b rows, a contact for each fingertip; `std_m` and `variance` are not used.
+        contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not used.
         mixture: the hand's learned model; None: only the library gives seeds.
-        world: what the links must not touch; None: only each other. All arguments are moved to the contacts' device.
+        world: what the links must not touch; None: only self-collision counts. All arguments are moved to the contacts'
+            device.
         method: "cobyla" is the paper's method (Sec. 6.3): tips touch with their contact points, in any direction.
         library: the hand's random postures; None: drawn when they are needed.
 
     Returns:
-        The best attempt for each row. With `Status.OK` every tip is within 1 mm of its contact and inside its pad's
+        The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of its contact and inside
+            its pad's
         cone, and every link is clear.
 
     Raises:
@@ -125,7 +127,7 @@ def solve_ik(
 
 
 def _refine_seeds(hand: Hand, contacts: Contacts, world: CollisionWorld, method: Method, seeds: IKSeeds) -> IKSolution:
-    """Return the refined and measured seeds."""
+    """Refine seeds and measure the resulting configurations."""
     refined, rolling = refine_exactly, True
     if method == "cobyla":
         refined, rolling = refine_by_cobyla, False
@@ -143,14 +145,14 @@ def _refine_seeds(hand: Hand, contacts: Contacts, world: CollisionWorld, method:
 def refine_exactly(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Refine with margins of clearance, then without margins if the links stay clear."""
+    """Refine with a margin of clearance, then without margin; keep the second result where links stay clear."""
     refined = refine(hand, configuration, contacts, world, EXACT)
     settled = refine(hand, refined, contacts, None, EXACT)
     return pick(measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined)
 
 
 def _no_solution(hand: Hand, contacts: Contacts) -> IKSolution:
-    """Return rows out of reach, or degenerate."""
+    """Return the solution of contact sets without seeds: NaN, with status `OUT_OF_REACH` or `DEGENERATE`."""
     b, f, nan = len(contacts), contacts.fingertips, contacts.points.new_full((), torch.nan)
     status = torch.where(degenerate(contacts.points), int(Status.DEGENERATE), int(Status.OUT_OF_REACH))
     placed = nan.expand(b, hand.dof), nan.expand(b, 4, 4), torch.arange(f, device=nan.device).expand(b, f)

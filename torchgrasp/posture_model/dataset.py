@@ -1,4 +1,4 @@
-"""Samples of a hand in a folder of chunks, each of (seed, chunk) alone and moved into place whole."""
+"""Posture samples on disk: a folder of chunks, each drawn from (seed, chunk number) and written atomically."""
 
 import dataclasses
 import json
@@ -36,10 +36,11 @@ Chunk = Annotated[int, Range(0, 1_000_000)]
 
 @dataclasses.dataclass(frozen=True)
 class SampleFolder:
-    """A complete folder of `n` samples; chunks are read on demand. `meta` is that of `HandSamples`.
+    """A complete folder of `n` posture samples; chunks are read on demand. `meta` is that of `HandSamples`.
 
-    Iteration is over chunks. By an index it is a map-style dataset for `torch.utils.data.DataLoader`: item i is the
-    joints (h,) and the code (6,) of posture i. The last few chunks that items were taken from stay in memory.
+    Iteration yields one chunk after another. By index the folder is a map-style dataset for
+    `torch.utils.data.DataLoader`: item i holds the joints (h,) and the code (6,) of posture i. Recent chunks stay in
+    memory.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -102,7 +103,7 @@ class SampleFolder:
 
     @checked
     def holds(self, i: Chunk) -> bool:
-        """Tell whether chunk i is on disk and sound."""
+        """Return whether chunk i is on disk and undamaged."""
         try:
             self.chunk(i)
         except ModelFileError:
@@ -118,13 +119,13 @@ def write_samples(
     workers: Annotated[int, Range(1, 1024)] = 1,
     observer: Callable[[int], object] = lambda count: None,
 ) -> SampleFolder:
-    """Write samples as of `sample_configurations` chunk by chunk.
+    """Write the samples of `sample_configurations` to a folder, chunk by chunk.
 
-    The same call continues a run that was interrupted or killed. `workers` threads draw at the same time. The observer
-    gets the number of postures on disk at first, then that of every new chunk.
+    The same call continues an interrupted run. `workers` threads draw at the same time. The observer is called with the
+    number of postures on disk at the start, then with the size of each new chunk.
 
     Raises:
-        BadArgument: workers outside [1, 1024], or a hand whose postures are hardly ever kept.
+        BadArgument: workers outside [1, 1024], or a hand of which almost all postures collide.
         OutputError: the folder holds other samples, another run is writing it, or the disk is full.
 
     >>> import tempfile
@@ -165,9 +166,9 @@ def write_samples(
 
 @checked
 def load_samples(folder: Path | str) -> SampleFolder:
-    """Open a complete folder of samples.
+    """Open a complete folder of posture samples.
 
-    An unfinished folder, or a damaged manifest, raises `ModelFileError`.
+    Raises `ModelFileError` for an unfinished folder or a damaged manifest.
 
     >>> import tempfile
     >>> from torchgrasp.hand.load import load_hand
@@ -192,7 +193,7 @@ def load_samples(folder: Path | str) -> SampleFolder:
 
 
 def _parse_manifest(folder: Path, manifest: Field) -> SampleFolder:
-    """Return the samples that a manifest describes."""
+    """Return the sample folder that a manifest describes."""
     fixed = {"torchgrasp": "samples", "version": 1, "chunk": CHUNK_POSTURES}
     fields = manifest.entries()
     if any(key not in fields or fields[key].value != value for key, value in fixed.items()):

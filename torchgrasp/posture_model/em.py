@@ -1,8 +1,8 @@
 """Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in each process that torchrun started.
 
-The data are standardised: every column has mean 0 and variance 1, or the features below would cancel. Each step is
-one matrix product over the features [1, x_i, x_i x_j]. The log-density of a Gaussian is linear in the features, and
-their sums weighted by responsibilities suffice for the maximisation. The sums are small enough to add over processes.
+The data are standardised to mean 0 and variance 1 in every column, because the features below would otherwise cancel.
+The log-density of a Gaussian is linear in the features [1, x_i, x_i x_j], so each step is one matrix product. Sums of
+the features, weighted by responsibilities, suffice for the maximisation and are small enough to add over processes.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ MAX_RESEEDS = 3  # a component that collapses more often shows that the data sup
 
 @dataclasses.dataclass(frozen=True)
 class Shard:
-    """The rows of one process. Several processes form the default group of torch.distributed."""
+    """The data rows of one process of several, which form the default group of torch.distributed."""
 
     rows: Float[Tensor, "n d"]
     rank: int = 0
@@ -33,7 +33,7 @@ class Shard:
 
     @staticmethod
     def of(rows: Float[Tensor, "n d"], distributed: bool) -> "Shard":
-        """Return the shard of this process; raises `BadArgument` for a distributed one without a group."""
+        """Return the shard of this process; raises `BadArgument` if `distributed` without a process group."""
         if not distributed:
             return Shard(rows)
         if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
@@ -68,10 +68,10 @@ class Components(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Progress(Value):
-    """State of a fit: with the data it determines the next step.
+    """The state of a fit; with the data it determines the next step.
 
-    `reseeded` counts how often each component was placed anew, a jump after which the likelihood may fall.
-    `log_likelihood` [nats] is the data's mean before each step.
+    `reseeded` counts how often each component collapsed and was placed anew; the likelihood may fall after that.
+    `log_likelihood` [nats] is the mean over the data before each step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
     >>> Progress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
@@ -86,7 +86,7 @@ class Progress(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Fit(Progress):
-    """A fitted mixture; the last log-likelihood belongs to its components."""
+    """The result of a fit; its last log-likelihood is that of the final components."""
 
     converged: bool = False
 
@@ -99,10 +99,10 @@ def expectation_maximisation(
     regularisation: float,
     observer: Callable[[Progress], None] = lambda progress: None,
 ) -> Fit:
-    """Iterate until a step raises the mean log-likelihood by less than `tolerance` [nats].
+    """Run EM steps until a step raises the mean log-likelihood by less than `tolerance` [nats].
 
-    `iterations` bounds the number of steps, steps before `start` included. `regularisation` is added to every variance.
-    An indefinite start, or a component that collapses too often, raises `IndefiniteCovariance`.
+    `iterations` bounds the number of steps, including those before `start`. `regularisation` is added to every
+    variance. Raises `IndefiniteCovariance` for an indefinite start, or a component that collapses too often.
     """
     n, state = shard.count(), start
     while True:
@@ -117,7 +117,7 @@ def expectation_maximisation(
 
 
 def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
-    """Return the responsibility-weighted sums of the features, and the log-likelihood of all data, Eq. (19)."""
+    """Return the sums of the features weighted by responsibilities, and the log-likelihood of all data, Eq. (19)."""
     # Rows of one pass on a GPU, which smaller passes leave idle; features take 200 MB (`scripts/bench.py gpu`)
     gpu_rows = 2**17
     x, coefficients = shard.rows, coefficients_from_components(components)
@@ -138,7 +138,7 @@ def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m 
 
 
 def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None = None) -> Float[Tensor, "f n"]:
-    """Return the features [1, x_i, x_i x_j (i <= j)] of every row as a column, written into `out` if it is given."""
+    """Return the features [1, x_i, x_i x_j (i <= j)] of each row as a column; `out` is the buffer to write into."""
     n, d = x.shape
     out = x.new_empty(1 + d + d * (d + 1) // 2, n) if out is None else out
     out[0] = 1
@@ -164,11 +164,11 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
 def maximisation(
     sums: Float[Tensor, "m f"], n: int, regularisation: float, reseeded: Int[Tensor, "m"]
 ) -> tuple[Components, Int[Tensor, "m"]]:
-    """Return the most likely components for the weighted sums; collapsed components are placed anew.
+    """Return the maximum-likelihood components from the weighted sums; collapsed components are placed anew.
 
-    A component collapses if its covariance is singular or its responsibilities sum to less than d + 1 rows. Half of the
-    heaviest component, split across its longest axis, then replaces it. If every component collapses, or one component
-    collapses more than `MAX_RESEEDS` times, `IndefiniteCovariance` is raised. `reseeded` counts the collapses.
+    A component collapses if its covariance is singular or its responsibilities sum to less than d + 1 rows. It is
+    replaced by half of the heaviest component, split across its longest axis. Raises `IndefiniteCovariance` if every
+    component collapses, or one of them more than `MAX_RESEEDS` times. `reseeded` counts the collapses.
     """
     components = components_from_sums(sums, n, regularisation)
     weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()
@@ -195,7 +195,7 @@ def maximisation(
 
 
 def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: float) -> Components:
-    """Return weights, means and covariances from the weighted sums of the features; a component without data is NaN."""
+    """Return weights, means and covariances from the weighted sums of features; NaN for a component without data."""
     d = round((math.sqrt(8 * sums.shape[1] + 1) - 3) / 2)  # from the number of features, 1 + d + d (d + 1) / 2
     count = sums[:, :1]
     means = sums[:, 1 : d + 1] / count
@@ -208,7 +208,7 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
 
 
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
-    """Return the clusters of k-means as m components; fewer different rows raise `BadArgument`."""
+    """Return m initial components, the clusters of k-means; raises `BadArgument` for fewer different rows."""
     rounds = 10  # rounds of Lloyd's algorithm: EM follows, so the clusters need not converge
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
@@ -222,7 +222,7 @@ def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> 
 
 
 def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]:
-    """Return random rows of all data, the same in every process."""
+    """Return random rows of the data of all processes, the same in every process."""
     subsample = 20_000  # rows among which k-means++ chooses its centres: some hundred for each component
     x = shard.rows
     lengths = x.new_zeros(shard.processes, dtype=torch.int64)
@@ -237,7 +237,7 @@ def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]
 
 
 def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -> Float[Tensor, "m d"]:
-    """Return centres drawn with probabilities proportional to the squared distance from the centres before."""
+    """Return m initial cluster centres by k-means++."""
     centres = pool[:1]
     squared = ((pool - centres) ** 2).sum(1)
     for k in range(1, m):
@@ -252,7 +252,7 @@ def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -
 def _sums_of_clusters(
     shard: Shard, centres: Float[Tensor, "m d"], features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]]
 ) -> Float[Tensor, "m f"]:
-    """Return the sums of the features over each cluster."""
+    """Return the sums of the features over the rows of each cluster."""
     sums = centres.new_zeros(len(centres), len(features(centres[:1])))
     for rows in shard.rows.split(CACHED_ROWS):
         nearest = (0.5 * (centres**2).sum(1) - rows @ centres.T).argmin(1)

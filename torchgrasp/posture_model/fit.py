@@ -1,4 +1,4 @@
-"""Learning how a hand can touch from sampled postures (Eqs. 19-20, Sec. 6.3), with checkpoints."""
+"""Fit of the learned posture model to sampled postures (Eqs. 19-20, Sec. 6.3), with checkpoints."""
 
 import dataclasses
 import math
@@ -25,9 +25,9 @@ TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes so
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The file of one fit; without a path nothing is kept. Process 0 writes it, all processes read it.
+    """The checkpoint file of one fit; `path` None: no file. Process 0 writes it, all processes read it.
 
-    Mean and standard deviation identify the data, `settings` the fit.
+    `centre` and `scale`, the data's mean and standard deviation, identify the data; `settings` identify the fit.
     """
 
     path: Path | None
@@ -37,7 +37,7 @@ class Checkpoint:
     settings: dict[str, str]
 
     def save(self, progress: Progress) -> None:
-        """Write the state atomically; raises `OutputError`."""
+        """Write the state of the fit atomically; raises `OutputError`."""
         if self.path is None or self.shard.rank > 0:
             return
         tensors = {**vars(progress.components), "centre": self.centre, "scale": self.scale}
@@ -45,7 +45,7 @@ class Checkpoint:
         save_tensors(self.path, "em", tensors, {**self.settings, "jumped": str(progress.jumped)})
 
     def load(self) -> Progress | None:
-        """Return the saved state, or None; raises `ModelFileError` or, for another fit's state, `BadArgument`."""
+        """Return the saved state, or None; raises `ModelFileError`, or `BadArgument` for the state of another fit."""
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
         # Processes at different steps would wait for each other for ever. Equal steps have no variance.
@@ -92,19 +92,21 @@ def fit_mixture(
     distributed: bool = False,
     observer: Callable[[Progress], None] = lambda progress: None,
 ) -> GraspMixture:
-    """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation from a k-means start.
+    """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation, initialised by k-means.
 
-    The mixture's `meta` reports iterations, convergence, components placed anew, mean log-likelihood and BIC. Codes are
-    exact functions of the joints, so BIC keeps falling as components are added: read its elbow, not its minimum.
+    The mixture's `meta` reports iterations, convergence, collapsed components, mean log-likelihood and BIC. Codes are
+    exact functions of the joints, so BIC keeps falling with more components: use its elbow, not its minimum.
 
     Args:
-        components: m, the number of Gaussians.
+        components: number m of Gaussians.
         iterations: largest number of steps.
         tolerance: stop when a step raises the mean log-likelihood by less [nats].
         regularisation: variance added to every dimension of a component, relative to its variance over all samples.
-        starts: k-means starts of consecutive seeds. Each takes `TRIAL_STEPS` steps; the likeliest continues.
-        checkpoint: file that holds the fit after every further step. A fit continues from it to the same bits.
-        distributed: whether `samples` are the shard of one process under torchrun. All must see the same checkpoint.
+        starts: number of k-means initialisations, with consecutive seeds. After `TRIAL_STEPS` steps of each the
+            likeliest continues.
+        checkpoint: file that stores the fit after every step. A fit that continues from it gives the same bits.
+        distributed: whether `samples` are the part of one process under torchrun. All processes must see the same
+            checkpoint.
 
     Raises:
         BadArgument: too few samples, a joint that does not vary, a number out of range, the checkpoint of another fit.
@@ -164,7 +166,7 @@ def fit_mixture(
 
 
 def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
-    """Give every column mean 0 and variance 1, in place; return the mean and standard deviation it had."""
+    """Scale every column to mean 0 and variance 1 in place; return the original means and standard deviations."""
     x, n = shard.rows, shard.count()
     centre = shard.sum(x.sum(0)) / n
     x.sub_(centre)
@@ -178,7 +180,7 @@ def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d
 
 
 def _likeliest(shard: Shard, starts: list[Progress], regularisation: float) -> Progress:
-    """Return the start of largest likelihood after `TRIAL_STEPS` steps, with these steps taken."""
+    """Run `TRIAL_STEPS` steps from each initial state; return the state of the greatest likelihood."""
     if len(starts) == 1:
         return starts[0]
     fits = [expectation_maximisation(shard, start, TRIAL_STEPS, 0.0, regularisation) for start in starts]

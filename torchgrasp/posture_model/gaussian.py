@@ -25,7 +25,7 @@ class GaussianMixture(Value):
 
     Raises:
         BadArgument: inconsistent shapes, weights that are negative or do not sum to 1, an indefinite or asymmetric
-            covariance, a name twice.
+            covariance, a repeated name.
 
     >>> mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
     >>> mixture.condition({"b": 3.0}).means
@@ -64,7 +64,7 @@ class GaussianMixture(Value):
 
     @checked
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density of rows, Eq. (19); raises `BadArgument` for rows of another length than d."""
+        """Return the log-density of each row, Eq. (19); raises `BadArgument` for rows that do not have d numbers."""
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
         return map_rows(lambda rows: torch.logsumexp(self.log_joint(rows), -1), x)
@@ -76,7 +76,7 @@ class GaussianMixture(Value):
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
-        """Draw n rows; n or seed out of range raises `BadArgument`."""
+        """Draw n random rows; raises `BadArgument` for n or seed out of range."""
         generator = torch.Generator().manual_seed(seed)
         weights, means = self.weights.double().cpu(), self.means.double().cpu()
         draw = torch.rand(n, generator=generator, dtype=torch.float64)
@@ -91,16 +91,16 @@ class GaussianMixture(Value):
 
     @checked
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
-        """Return the marginal density of some dimensions, Eq. (22); raises `BadArgument` for an unknown name."""
+        """Return the marginal mixture of the named dimensions, Eq. (22); raises `BadArgument` for an unknown name."""
         index = self._index(names)
         block = self.covariances.double()[:, index][:, :, index]
         return GaussianMixture(self.weights.double(), self.means.double()[:, index], block, tuple(names))
 
     @checked
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the density of the other dimensions given the values of some: bracket and h_i of Eq. (23).
+        """Return the mixture of the other dimensions, given the values of some: bracket and h_i of Eq. (23).
 
-        Components of weight 0 are left out. Unknown names or non-finite values raise `BadArgument`.
+        Components of weight 0 are left out. Raises `BadArgument` for unknown names or non-finite values.
         """
         observed = self._index(tuple(given))
         rest = [i for i in range(len(self.names)) if i not in observed]
@@ -125,14 +125,14 @@ class GaussianMixture(Value):
         return self.weights.double() @ self.means.double()
 
     def covariance(self) -> Float[Tensor, "d d"]:
-        """Return the covariance, within components and between their means."""
+        """Return the covariance matrix of the whole mixture."""
         offset = self.means.double() - self.mean()
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
         return within + torch.einsum("m,mi,mj->ij", self.weights.double(), offset, offset)
 
     @functools.cached_property
     def whitening(self) -> "Whitening":
-        """The components in whitened form, for the evaluation of densities."""
+        """The whitened components, for the evaluation of densities."""
         means, d, matrix = self.means.double(), len(self.names), whitening_matrices(self.covariances.double())
         log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * d * math.log(2 * math.pi)
         return Whitening(matrix, (matrix @ means[..., None])[..., 0], log_scale)
@@ -160,7 +160,7 @@ class Whitening:
 
 
 def map_rows(function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor, "*b d"]) -> Tensor:
-    """Apply a function to rows in float64, a chunk at a time; restore batch axes and dtype."""
+    """Apply a function to all rows in float64, chunk by chunk; batch axes and dtype are as in `x`."""
     y = torch.cat([function(rows) for rows in x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)])
     return y.reshape(x.shape[:-1] + y.shape[1:]).to(x.dtype)
 

@@ -1,4 +1,4 @@
-"""The learned model of a hand: a Gaussian mixture over joints and the codes of its contacts (Eqs. 15-23)."""
+"""The learned posture model of a hand: a Gaussian mixture over joints and contact codes (Eqs. 15-23)."""
 
 import dataclasses
 import functools
@@ -30,12 +30,12 @@ DEFAULT_ENERGY = 6.295793622
 
 
 def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b q"]:
-    """Return the code q = (L, N) of points with unit normals, Eq. (18): six numbers of three points, as in the paper.
+    """Return the rigid-motion-invariant code q = (L, N) of points with unit normals, Eq. (18).
 
-    L_i is the distance [m] of point i from the centre of the points; N is n1.n2, n1.n3, n2.n3 and so on. Rigid
-    motion does not change the code. Negated normals do not change it either, so fingertips have the code of the
-    contacts that they touch. Nor do a mirror image or a rotation of the normals alone: every match has to be checked
-    afterwards.
+    L_i is the distance [m] of point i from the centroid; N holds the cosines n1.n2, n1.n3, n2.n3 and so on. For three
+    points, as in the paper, the code has six numbers. Negated normals have the same code, so fingertips have the code
+    of the contacts that they touch. Mirror images also share the code, and so do normals that are rotated together:
+    check every match.
     """
     lengths = torch.linalg.vector_norm(points - points.mean(-2, keepdim=True), dim=-1)
     cosines = torch.stack([(n * m).sum(-1) for n, m in itertools.combinations(normals.unbind(-2), 2)], dim=-1)
@@ -44,9 +44,10 @@ def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*
 
 @checked
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
-    """Encode contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
+    """Return the codes of contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
 
-    Points [m] and unit normals are (b, 3, 3). A triple without a virtual frame holds NaN and `Status.DEGENERATE`.
+    Points [m] and unit normals have shape (b, 3, 3). A triple without a virtual frame gives NaN and
+    `Status.DEGENERATE`.
 
     Raises:
         BadArgument: wrong shapes, non-finite numbers, or normals whose length is not 1 within 1e-3.
@@ -76,13 +77,16 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
 
 
 def describe_compatibility(hand: Hand) -> dict[str, str]:
-    """Return the metadata of samples and models about their hand: name, fingers, hash of its files, some codes."""
+    """Return metadata that identifies the hand of samples and models: name, fingers, hash of its files, some codes."""
     codes = " ".join(f"{x:.7f}" for x in _probe_codes(hand).flatten().tolist())
     return {"hand": hand.name, "fingers": hand.source.option, "hand_sha256": hand.source.sha256, "hand_codes": codes}
 
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
-    """Refuse a model of another hand, fingers, limits or fingertips; without `hand_codes`, of other joint names."""
+    """Raise `BadArgument` for a model of another hand, or of other fingers, joint limits or fingertips.
+
+    If `meta` has no `hand_codes`, only the joint names are compared.
+    """
     # Largest difference of two codes [m or cosine] by rounding: `describe_compatibility` writes seven digits
     tolerance = 1e-5
     if joint_names != hand.joint_names:
@@ -101,7 +105,7 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
 
 
 def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
-    """Return codes (Eqs. 15-18) of three fixed postures: a fingerprint of the hand that a model was learned for."""
+    """Return the codes (Eqs. 15-18) of three fixed postures: a fingerprint of the hand."""
     lower, upper = hand.lower.double(), hand.upper.double()
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
     index = (torch.arange(hand.dof)[None] + torch.arange(3)[:, None]) % 3
@@ -111,10 +115,11 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspMixture(GaussianMixture):
-    """The joint density of joints and codes of one hand (Eqs. 19-20); the names must end with `CODE_NAMES`.
+    """The learned mixture over the joints and contact codes of one hand (Eqs. 19-20).
 
-    The dimensions are the joints [rad], in the order of the hand, then the code: L1 L2 L3 [m] N1 N2 N3. The fit added
-    `regularisation` to every variance, relative to the samples' variance. `meta` describes hand, samples and fit.
+    The dimensions are the joints [rad], in the hand's order, then the code L1 L2 L3 [m] N1 N2 N3; the names must end
+    with `CODE_NAMES`. `regularisation` was added to every variance, relative to the samples' variance. `meta` describes
+    hand, samples and fit.
 
     >>> from torchgrasp import encode
     >>> from torchgrasp.hand.load import load_hand
@@ -146,13 +151,13 @@ class GraspMixture(GaussianMixture):
 
     @functools.cached_property
     def _regression(self) -> Float[Tensor, "m h 6"]:
-        """Sigma_(Theta,q) Sigma_q^-1 of Eq. (23)."""
+        """Regression of the joints on the code in each component: Sigma_(Theta,q) Sigma_q^-1 of Eq. (23)."""
         whitening = self._code.whitening.matrix
         return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
 
     @functools.cached_property
     def _stacked_regression(self) -> Float[Tensor, "k h"]:
-        """The conditional mean of every component as a matrix that multiplies (q, 1); the matrices are stacked."""
+        """The conditional means of all components as stacked matrices that multiply (q, 1)."""
         at_zero = self.means[:, :-6].double() - (self._regression @ self.means[:, -6:, None].double())[..., 0]
         return torch.cat([self._regression.transpose(1, 2), at_zero[:, None]], 1).flatten(0, 1)
 
@@ -160,13 +165,14 @@ class GraspMixture(GaussianMixture):
     def energy(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b"]:
         """Return min_i f_i of Eq. (21): half the squared Mahalanobis distance to the nearest component.
 
-        The hand reaches codes below `DEFAULT_ENERGY`, or `PAPER_ENERGY`. NaN gives NaN.
+        The hand probably reaches a code if this value is below `DEFAULT_ENERGY`, or the paper's `PAPER_ENERGY`. NaN
+        gives NaN.
         """
         return map_rows(lambda q: 0.5 * self._code.whitening.squared(q).amin(-1), _codes(code))
 
     @checked
     def joints(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b h"]:
-        """Return the expected joints [rad] given a code, Eq. (23), which may pass the limits; NaN gives NaN."""
+        """Return the expected joints [rad] given a code, Eq. (23); they may exceed the limits. NaN gives NaN."""
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
             # sum_i h_i A_i (q, 1) as one matrix product
@@ -180,9 +186,10 @@ class GraspMixture(GaussianMixture):
     def modes(
         self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
     ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
-        """Return the conditional means of the k components most responsible for a code, and their h_i of Eq. (23).
+        """Return the joint means of the k components most responsible for a code, and their h_i of Eq. (23).
 
-        If several postures have the code, their mean may be none of them. A k outside [1, m] raises `BadArgument`.
+        Use them where several postures have the same code: the expected joints may then be none of these postures.
+        Raises `BadArgument` for k outside [1, m].
         """
         check_whole("k", k, 1, len(self.weights))
 
@@ -198,12 +205,12 @@ class GraspMixture(GaussianMixture):
         return modes[..., :-1], modes[..., -1]
 
     def _log_responsibility(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m"]:
-        """Return log h_i of Eq. (23); the logarithm does not underflow far from every component."""
+        """Return log h_i of Eq. (23), without underflow far from every component."""
         return torch.log_softmax(self._code.log_joint(q), dim=-1)
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the mixture atomically as safetensors for `load_mixture`; raises `OutputError`.
+        """Write the mixture atomically as safetensors; `load_mixture` reads it. Raises `OutputError`.
 
         >>> import tempfile
         >>> file = load_mixture("barrett").save(Path(tempfile.mkdtemp(), "mixture.safetensors"))
@@ -216,7 +223,7 @@ class GraspMixture(GaussianMixture):
 
 
 def _codes(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
-    """Return the codes q of an argument; refuse rows of other than six numbers."""
+    """Return the codes q as a tensor; raise `BadArgument` for rows that do not have six numbers."""
     q = code.q if isinstance(code, ContactCode) else code
     if q.ndim < 1 or q.shape[-1] != 6:
         raise BadArgument("code", f"shape {tuple(q.shape)}", "rows of 6 numbers, L and N")
@@ -225,9 +232,9 @@ def _codes(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
 
 @checked
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
-    """Read a mixture by the name or folder of its hand, or by the path of its .safetensors file.
+    """Read the learned mixture of a hand, by the hand's name or folder, or by the path of a .safetensors file.
 
-    An unknown hand raises `HandFileError`, a missing or malformed file `ModelFileError`.
+    Raises `HandFileError` for an unknown hand, `ModelFileError` for a missing or malformed file.
 
     >>> load_mixture("allegro").means.shape
     torch.Size([40, 18])
@@ -245,7 +252,7 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
 
 
 def mixture_path(name_or_path: Path | str) -> Path:
-    """Return a .safetensors path as it is, else mixture.safetensors in the folder of a hand; raises `HandFileError`."""
+    """Return the path of a mixture: a .safetensors path unchanged, or mixture.safetensors in a hand's folder."""
     if Path(name_or_path).suffix == ".safetensors":
         return Path(name_or_path)
     return find_hand(name_or_path) / "mixture.safetensors"

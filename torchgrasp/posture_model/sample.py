@@ -1,6 +1,6 @@
-"""Random postures of a hand without self-collision: the data of its learned model (Sec. 4.1).
+"""Random postures of a hand without self-collision: the training data of its learned model (Sec. 4.1).
 
-Round fingertips roll: contacts may lie beside the middle of a pad. The contacts must be able to hold something.
+Round fingertips roll, so contacts may lie beside the middle of a pad. The contacts of a posture must allow closure.
 """
 
 import dataclasses
@@ -31,10 +31,10 @@ BALANCES = 200  # directions in the three-dimensional space of internal forces t
 def roll_contacts(
     hand: Hand, joints: Float[Tensor, "n h"], generator: np.random.Generator
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
-    """Return contact points [m] and outward normals of fingertips that touch beside the middle of their pads.
+    """Return random contact points [m] and outward normals of fingertips that touch beside the middle of their pads.
 
-    Both tilts of a contact direction from the pad's axis are normal, of deviation `ROLL`, inside the pad's cone. The
-    point of a round tip follows its direction. A flat tip touches with its contact point and only tilts.
+    The two tilts of a contact direction from the pad's axis are Gaussian with deviation `ROLL`, truncated to the pad's
+    cone. The contact point of a round tip follows the direction. A flat tip keeps its contact point and only tilts.
     """
     points, axes = hand.fingertips(joints)
     cone, radius = hand.tips.cone.to(axes), hand.tips.radius.to(axes)
@@ -49,9 +49,9 @@ def roll_contacts(
 
 
 def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -> Bool[Tensor, "n"]:
-    """Tell which contacts balance forces inside the friction cones of `ContactSpec`, Eq. (13), with three of them.
+    """Return which postures have three contacts that balance forces inside the friction cones, Eq. (13).
 
-    Balanced forces of three contacts run along the triangle's sides. A grid over them finds all but narrow closures.
+    Balanced forces of three contacts act along the triangle's sides; a grid over them finds all but marginal closures.
     `normals` point out of the fingertips, into the object.
     """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
@@ -62,7 +62,7 @@ def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -
 
 
 def _close_triples(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3"]) -> Bool[Tensor, "n"]:
-    """Tell which triples balance forces."""
+    """Return which contact triples balance forces inside their friction cones."""
     spread = 1 + ContactSpec().friction ** 2
     t12, t13, t23 = fibonacci_sphere(BALANCES).to(points).T
     e12, e13, e23 = (unit(points[:, j] - points[:, i]) for i, j in ((0, 1), (0, 2), (1, 2)))
@@ -91,7 +91,7 @@ Sampling = Literal["uniform", "grasping"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """Postures `joints` [rad] of one hand and their codes `q` (Eq. 18); `meta` names the hand and the draw.
+    """Postures of one hand, `joints` [rad], and their codes `q` (Eq. 18); `meta` names hand, seed and sampling.
 
     >>> from torchgrasp import load_hand
     >>> samples = sample_configurations(load_hand("barrett"), 50)
@@ -105,16 +105,17 @@ class HandSamples(Batch):
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def rows(self) -> Float[Tensor, "n d"]:
-        """Return joints and codes side by side."""
+        """Return joints and codes, concatenated."""
         return torch.cat([self.joints, self.q], dim=-1)
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
-    """Which n free postures are drawn, see `Sampling`.
+    """Which n collision-free postures are drawn; see `Sampling`.
 
-    Chunk i comes from (seed, i) alone, so fewer samples are a prefix of more. Other values raise `BadArgument`.
+    Chunk i depends only on (seed, i), so a smaller set of samples is the beginning of a larger one. Raises
+    `BadArgument` for values out of range.
 
     >>> from torchgrasp import load_hand
     >>> SampleSpec(1000, seed=7).meta(load_hand("barrett"))["seed"]
@@ -127,7 +128,7 @@ class SampleSpec(Value):
 
     @checked
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return what distinguishes samples, but for their number."""
+        """Return metadata that identifies the samples: hand, seed and sampling, without their number."""
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
 
@@ -140,10 +141,10 @@ def sample_configurations(
     sampling: Sampling = "uniform",
     observer: Callable[[int], object] = lambda count: None,
 ) -> HandSamples:
-    """Draw postures uniformly within the joint limits and keep those free of self-collision (Sec. 6.3).
+    """Draw random postures within the joint limits, and keep those free of self-collision (Sec. 6.3).
 
-    `SampleSpec` explains n, seed and sampling. The observer gets every chunk's number of postures. An argument out of
-    range, or a hand whose postures are hardly ever kept, raises `BadArgument`.
+    `SampleSpec` explains n, seed and sampling. The observer is called with the size of every new chunk. Raises
+    `BadArgument` for an argument out of range, or a hand of which almost all postures collide.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape
@@ -162,12 +163,12 @@ def sample_configurations(
 
 
 def chunk_sizes(n: int) -> list[int]:
-    """Return the number of postures of each chunk: `CHUNK_POSTURES`, and the rest in the last."""
+    """Return the number of postures in each chunk: `CHUNK_POSTURES`, the last chunk has the rest."""
     return [min(CHUNK_POSTURES, n - first) for first in range(0, n, CHUNK_POSTURES)]
 
 
 def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
-    """Return the kept postures of chunk i, their codes, and the number of postures drawn for them."""
+    """Return the kept postures of chunk i, their codes, and how many postures were drawn to find them."""
     least_kept = 1e-3  # least share of postures that are kept, after ten blocks: another hand would draw for hours
     count, parts, kept = chunk_sizes(spec.n)[i], [], 0
     blocks = _draw_blocks(hand, np.random.default_rng((spec.seed, i)), spec.sampling)
@@ -183,7 +184,7 @@ def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h
 def _draw_blocks(
     hand: Hand, generator: np.random.Generator, sampling: Sampling
 ) -> Iterator[tuple[Float[Tensor, "n h"], Float[Tensor, "n q"]]]:
-    """Yield the kept postures of one block of draws after another, with their codes."""
+    """Yield blocks of kept postures with their codes, without end."""
     lower, upper = hand.lower.double(), hand.upper.double()
     while True:
         uniform = torch.from_numpy(generator.random((BLOCK_POSTURES, hand.dof))).to(lower.device)

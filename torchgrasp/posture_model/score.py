@@ -1,4 +1,4 @@
-"""How good a learned model is: errors on held-out postures (Sec. 6.3), and the criterion for its size (Fig. 6)."""
+"""Quality of a learned model: errors on held-out postures (Sec. 6.3), and the BIC over model size (Fig. 6)."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -24,12 +24,12 @@ class MixtureScore(Value):
     """Errors of a model on held-out postures.
 
     Args:
-        joint_names: of the errors.
+        joint_names: names of the joints.
         error: mean absolute error of the conditional mean, Eq. (23), of each joint [rad].
         deviation: standard deviation of the absolute error over the postures [rad].
-        nearest_mode: mean absolute error of the nearest of the first `COMPARED_MODES` modes [rad].
-        paper_coverage, default_coverage: shares of codes below `PAPER_ENERGY` and `DEFAULT_ENERGY`.
-        log_likelihood: mean over the postures [nats].
+        nearest_mode: mean absolute error of the best of the first `COMPARED_MODES` modes [rad].
+        paper_coverage, default_coverage: fractions of codes below `PAPER_ENERGY` and `DEFAULT_ENERGY`.
+        log_likelihood: mean log-likelihood of a posture [nats].
         postures: number of postures.
     """
 
@@ -48,7 +48,7 @@ class MixtureScore(Value):
         return float(self.error.mean())
 
     def __str__(self) -> str:
-        """Return the errors of Table 5 and Fig. 8, and the acceptance of Eq. (21)."""
+        """Return a table of the errors (Table 5, Fig. 8) and the fraction of codes within reach (Eq. 21)."""
         rows = zip(self.joint_names, self.error.tolist(), self.deviation.tolist(), strict=True)
         joints = "\n".join(f"  {name:20s} {error:.3f} +- {deviation:.3f}" for name, error, deviation in rows)
         return (
@@ -61,7 +61,7 @@ class MixtureScore(Value):
         )
 
     def meta(self) -> dict[str, str]:
-        """Return the metadata for the file of the mixture."""
+        """Return the scores as metadata for the mixture's file."""
         return {
             "held_out": str(self.postures),
             "held_out_log_likelihood": f"{self.log_likelihood:.6f}",
@@ -73,7 +73,7 @@ class MixtureScore(Value):
 
 
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
-    """Evaluate a model on at least two held-out postures of its joints."""
+    """Return the errors of a model on held-out postures, at least two."""
     if samples.joint_names != mixture.joint_names:
         raise BadArgument("samples", f"joints {samples.joint_names}", f"the mixture's {mixture.joint_names}")
     if len(samples) < 2:
@@ -96,13 +96,13 @@ def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScor
 
 @dataclasses.dataclass(frozen=True)
 class BicCurve(Value):
-    """The criterion for each number of components; less is better."""
+    """The Bayesian information criterion (BIC) for each number of components; smaller is better."""
 
     components: Int[Tensor, "k"]
     bic: Float[Tensor, "k"]
 
     def __str__(self) -> str:
-        """Return the curve as a table, with its minimum."""
+        """Return the BIC values as a table, with their minimum."""
         rows = [f"  {m:3d} {b:14.0f}" for m, b in zip(self.components.tolist(), self.bic.tolist(), strict=True)]
         least = int(self.components[self.bic.argmin()])
         end = ", the largest asked for: no minimum is seen" if least == int(self.components.max()) else ""
@@ -117,15 +117,15 @@ def bic_curve(
     observer: Callable[[int, GraspMixture], None] = lambda m, mixture: None,
     **fit: Any,
 ) -> BicCurve:
-    """Fit a mixture for each number of components and return their criterion (Fig. 6 b, d).
+    """Fit a mixture for each number of components, and return the BIC of each (Fig. 6 b, d).
 
-    Codes of the middles of pads are exact functions of the joints: the criterion then falls for ever. Where tips roll,
-    it flattens and has a minimum.
+    Codes of "uniform" samples are exact functions of the joints, so the BIC falls without end. For "grasping" samples,
+    whose fingertips roll, the BIC has a minimum.
 
     Args:
         samples: postures to fit.
-        components: numbers to try.
-        checkpoints: folder of the fits' checkpoints; a killed sweep continues from them.
+        components: numbers of components to try.
+        checkpoints: folder for the checkpoints of all fits; an interrupted call continues from them.
         observer: called after each fit with its number of components and its mixture.
         fit: seed, iterations, tolerance and regularisation of `fit_mixture`.
 

@@ -1,6 +1,6 @@
-"""From observations to a posterior, Eqs. (7)-(8): all at once, later ones, and the most informative ones.
+"""From observations to the posterior, Eqs. (7)-(8): from all at once, from later ones, from the most informative.
 
-Each way makes one Cholesky factor L of K + noise. Further observations append rows to it.
+Each function builds one Cholesky factor L of K + noise. Further observations append rows to L.
 """
 
 import dataclasses
@@ -32,9 +32,9 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
 
 
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
-    """Refuse observations farther apart than the kernel allows (its diameter), unless K is positive definite.
+    """Raise `IndefiniteCovariance` if observations are farther apart than the kernel allows and K is indefinite.
 
-    Generous noise on some rows can hide an indefinite K, so K is factored again with the least noise on all rows.
+    Large noise on some observations can hide an indefinite K, so K is factored again with the least noise.
     """
     kernel = posterior.kernel
     if longest_distance(posterior.x) > kernel.diameter:
@@ -44,19 +44,19 @@ def check_kernel(posterior: Posterior, least_noise: float) -> None:
 
 
 def longest_distance(x: Float[Tensor, "n 3"]) -> float:
-    """Return the longest distance between two of the points."""
+    """Return the longest distance between any two points."""
     return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
 
 
 def append_observations(
     posterior: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None
 ) -> Posterior:
-    """Return the posterior given `new` observations, too: equal to the posterior given all of them at once.
+    """Return the posterior given `new` observations besides the old: equal to conditioning on all at once.
 
     The factor L grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
 
-    `shared` holds correlated errors of the new distances, a column of deviations for each independent cause. They add
-    shared shared^T to the noise.
+    `shared` holds correlated errors of the new distances: standard deviations, one column for each independent cause.
+    They add shared shared^T to the noise.
     """
     kernel = posterior.kernel
     if shared is not None:
@@ -80,7 +80,7 @@ def append_observations(
 
 @dataclasses.dataclass(frozen=True)
 class Selection(Value):
-    """Rows of the picked candidates, in order, and the posterior given them."""
+    """The indices of the picked candidates, in order, and the posterior given them."""
 
     picks: Int[Tensor, "picks"]
     posterior: Posterior
@@ -94,14 +94,15 @@ def select_points(
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Pick candidates to observe, each the most informative given those before it.
+    """Pick the candidate points to observe, each the most informative given those picked before.
 
-    The factor grows by four rows with each pick (pivoted Cholesky), and becomes the posterior's own.
+    Each pick appends four rows to the factor (pivoted Cholesky), which becomes the posterior's factor.
 
     Args:
-        candidates: points of the surface, all with normals.
-        known: what is observed already, such as points inside and outside.
-        criterion: greatest posterior variance; greatest |mean distance| ("error"); |mean| + 2 sqrt(variance) ("both").
+        candidates: points on the surface, all with normals.
+        known: observations that are already made, such as points inside and outside.
+        criterion: what makes a point informative: "variance", its posterior variance; greatest |mean distance|
+            ("error"); |mean| + 2 sqrt(variance) ("both").
         stop: the selection ends when no candidate has a greater variance.
     """
     x, start = candidates.x, posterior_given(known, kernel)
@@ -148,7 +149,7 @@ def select_points(
 
 
 def _score(criterion: Criterion, variance: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Return how informative the candidates are."""
+    """Return how informative each candidate is."""
     if criterion == "variance":
         return variance
     if criterion == "error":
@@ -163,7 +164,7 @@ def _extend(
     whitened: Float[Tensor, "rows"],
     new_order: Int[Tensor, "fresh"] | None = None,
 ) -> Posterior:
-    """Return the posterior given `new` observations, too, from the factor of all rows.
+    """Return the posterior given `new` observations too, from the grown Cholesky factor.
 
     In `new` points with normals are first. `whitened` is L^-1 y. `new_order` gives the row of `Observations.rows` for
     each new row of the factor; None: the same.
@@ -182,7 +183,7 @@ def _extend(
 
 
 def _row_of_each(old: Bool[Tensor, "n"], new: Bool[Tensor, "m"]) -> Int[Tensor, "rows"]:
-    """Return the row in the joint order of each old and each new row."""
+    """Return the row of each old and each new observation after joining: points with normals come first."""
     n, m, near, fresh = len(old), len(new), int(old.sum()), int(new.sum())
     total, oriented = n + m, near + fresh
     line = torch.arange(total, device=old.device)

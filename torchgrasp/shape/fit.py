@@ -1,4 +1,4 @@
-"""From a cloud to a shape: what is observed on its seen and its hidden side."""
+"""Fit of the shape to a point cloud: choice of the observations on the seen and the hidden side."""
 
 import dataclasses
 import math
@@ -60,29 +60,30 @@ def fit_shape(
     kernel: KernelName | Kernel = "thin_plate",
     criterion: Criterion = "variance",
 ) -> ShapeGP:
-    """Return the posterior of an object's shape given a partial cloud, Eqs. (2)-(9).
+    """Return the Gaussian process posterior of an object's shape, given a partial point cloud, Eqs. (2)-(9).
 
-    "camera" cleans the cloud and observes metric distances. It adds the outline and the mirrored cloud as noisier
-    observations. It keeps the shape out of free space and out of the table.
+    With `support` "camera" the cloud is cleaned and signed distances are in metric proportion. The object's outline and
+    the mirrored cloud are added as noisier observations. The shape is kept out of free space and of the table.
 
-    "paper" observes the cloud's centre at d = -1 and 20 random points around it at d = +1.
+    With "paper" the cloud's centre is observed at d = -1, and 20 random points around it at d = +1.
 
     Args:
         cloud: points [m] of one object, of one view or of several (`merge_clouds`), prepared by `prepare_cloud`. Given
-            normals distinguish a whole surface from a view. Walls thinner than the cloud's spacing merge,
-            but an open vessel seen from above on a `table` has two walls (`HollowShape`).
-        noise: standard deviation of an observed signed distance, normalised; for "paper" of normals too.
-        budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. None:
-            85 for "camera", besides outline and mirrored points, and 70 for "paper". "sure": until no point's
-            variance exceeds `noise`, the paper's rule, 1000 at most.
-        psi_scale: psi over the longest distance of the observations; below 1.34 the covariance may be indefinite.
+            normals distinguish a whole surface from a view. Walls thinner than the cloud's spacing merge, but an open
+            vessel seen from above on a `table` has two walls (`HollowShape`).
+        noise: standard deviation of an observed signed distance, normalised; with "paper" also of a normal.
+        budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. None: 85
+            for "camera", outline and mirrored points not counted, and 70 for "paper". "sure": until no point's variance
+            exceeds `noise`, the paper's rule, at most 1000.
+        psi_scale: ratio of the kernel's psi to the longest distance of the observations; below 1.34 the covariance may
+            be indefinite.
         support: "camera" or "paper".
-        seed: of the random draws.
+        seed: random seed.
         table: the table's plane, or its height [m] along z; only "camera" uses it.
-        kernel: "thin_plate", "matern52" or "rbf" with the length of psi (`kernel_by_name`); or a `Kernel` of
-            normalised distances.
-        criterion: the most informative point has the greatest "variance"; the greatest "error", |mean distance|; or
-            the greatest sum of "both", |error| + 2 sqrt(variance).
+        kernel: "thin_plate", "matern52" or "rbf" with the length of psi (`kernel_by_name`); or a `Kernel` of normalised
+            distances.
+        criterion: the most informative point has the greatest "variance"; the greatest "error", |mean distance|; or the
+            greatest sum of "both", |error| + 2 sqrt(variance).
 
     Raises:
         BadArgument: an argument out of range; a cloud that `prepare_cloud` refuses; a view that is not wholly in
@@ -103,7 +104,7 @@ def fit_shape(
 
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
-    """How a surface is fitted: see `fit_shape`."""
+    """Options of a shape fit; see the arguments of `fit_shape`."""
 
     noise: float = 0.01
     budget: int | Literal["sure"] | None = None
@@ -114,7 +115,7 @@ class FitOptions:
 
 
 def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitOptions) -> ShapeGP:
-    """Return `fit_shape` of a cloud without duplicates in its `upright_frame`, with the height of the table there."""
+    """Fit the shape in the `upright_frame` to a cloud without duplicate points; `table` is the table's height [m]."""
     generator, noise = torch.Generator().manual_seed(seed), options.noise
     seen = prepare_cloud(cloud, generator, clean=options.support == "camera")
     if options.support == "paper":
@@ -135,7 +136,7 @@ def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitO
 
 
 def _fit_surface(seen: PreparedCloud, support: Support, options: FitOptions) -> ShapeGP:
-    """Return the posterior of one surface, in the upright frame."""
+    """Return the posterior of one surface, in the upright frame, from the cloud and its supporting observations."""
     cloud, points, normals = seen.cloud, seen.points, seen.normals
     if support.rows is not None:
         points, normals = points[support.rows], normals[support.rows]
@@ -182,10 +183,11 @@ def condition(
 
     Args:
         observations: distances and normals, with their noise.
-        normalisation: the frame of the observations.
-        cloud: what the camera saw [m].
-        psi_scale: psi over the longest distance of the observations; the paper's 1 makes the covariance indefinite.
-        std_factor: real deviations over the posterior's.
+        normalisation: centre and scale of the normalised frame.
+        cloud: the points that the camera saw [m].
+        psi_scale: ratio of psi to the longest distance of the observations; the paper's 1 makes the covariance
+            indefinite.
+        std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
         kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
 
     Raises:
@@ -207,7 +209,7 @@ def condition(
 
 
 def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> None:
-    """Warn of a view that is cut off, has a gap, or shows two bodies on a table with normal z."""
+    """Warn if the image border cuts the object off, the view has a gap, or two bodies stand on the table."""
     if outline.cut:
         _warn(CutOff, "the border of the image cuts the object off: the part beyond it is a guess; turn the camera")
     if outline.gap > 0.025:  # [m]; a narrower gap, such as a handle's, does not mislead a fingertip
@@ -223,7 +225,7 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
 
 
 def _warn(kind: type[Warning], sentence: str) -> None:
-    """Show a warning at the first caller outside of the library."""
+    """Show a warning with the line of the caller outside the library."""
     frames: list[FrameType] = [frame := sys._getframe()]
     while (frame := frame.f_back) is not None:
         frames.append(frame)

@@ -1,4 +1,4 @@
-"""The shape as a Gaussian process over signed distance and normal, Eqs. (1), (7)-(9), in metres."""
+"""The shape as a Gaussian process over signed distance and normal, Eqs. (1), (7)-(9), with an interface in metres."""
 
 import dataclasses
 from typing import Annotated, Any
@@ -31,19 +31,19 @@ MAX_JOINT = 1000  # most points of one joint posterior: its memory grows with th
 
 @dataclasses.dataclass(frozen=True)
 class ShapeGP(Posterior, Normalisation):
-    """The posterior of an object's shape: g of Eq. (1), conditioned on observations. `fit_shape` makes it.
+    """The posterior of an object's shape: g of Eq. (1) given observations. `fit_shape` returns it.
 
     `predict`, `mean`, `mean_and_gradient`, `normalise` and `metres` are differentiable. Other methods refuse points
     that require a gradient.
 
     Args:
-        psi: length of the kernel, normalised: the thin plate's parameter.
+        psi: the kernel's length psi, normalised.
         domain_radius: radius, normalised, of the ball in which the posterior is valid.
-        std_factor: ratio of the surface's real deviations to the posterior's, measured on hidden sides of known
+        std_factor: ratio of the surface's true deviations to the posterior's standard deviations, calibrated on known
             objects.
-        cloud: what the camera saw, after cleaning.
-        kind: what the hidden side follows from: "ball", "revolution", "mirrored", "vessel", "guess" (the outline
-            alone), "cut off" by the image's border, or "whole" without a hidden side.
+        cloud: the points that the camera saw, after cleaning.
+        kind: how the hidden side was completed: "ball", "revolution", "mirrored", "vessel", "guess" (from the outline
+            alone), "cut off" (by the image border), or "whole" (no hidden side).
 
     >>> from torchgrasp import fit_shape, load_object
     >>> view = load_object("jug").view
@@ -68,7 +68,7 @@ class ShapeGP(Posterior, Normalisation):
         psi: Positive,
         std_factor: Positive = 1.0,
     ) -> "ShapeGP":
-        """Return the shape of a posterior, with its domain."""
+        """Return the shape of a posterior; its domain follows from kernel and observations."""
         # Far from all observations the posterior has no information.
         reach = 1.25 * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
         return cls(
@@ -81,7 +81,7 @@ class ShapeGP(Posterior, Normalisation):
         )
 
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
-        """Return the shape on another device. It stays in float64, which its condition number needs."""
+        """Return the shape on another device, always in float64, which its condition number requires."""
         check_moved(*args, **kwargs)
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
         return super().to(device)
@@ -93,24 +93,24 @@ class ShapeGP(Posterior, Normalisation):
 
     @property
     def walls(self) -> "tuple[ShapeGP, ...]":
-        """The surfaces that enclose the material, each with a posterior of its own."""
+        """The surfaces that enclose the material, each a shape: here only this one."""
         return (self,)
 
     @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Return which wall is the surface at normalised points."""
+        """Return which of the `walls` is the surface at normalised points."""
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
     @checked(gradients=True)
     def contains(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-        """Return which points [m] lie in the domain."""
+        """Return which points [m] lie in the domain, where the posterior is valid."""
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
 
     @checked(gradients=True)
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and their covariance at points [m] in the cloud's frame, Eqs. (7)-(8).
 
-        The estimate has the dtype of `points`. It passes first derivatives to points that require a gradient, except
+        The estimate has the dtype of `points`. First derivatives flow back to points that require a gradient, except
         from `covariance`.
 
         Raises:
@@ -137,7 +137,7 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return distance, normal, variance and std_m differentiated by the query points [m]. Raises as `predict`.
+        """Return the derivatives of distance, normal, variance and std_m by the query points [m]. Raises as `predict`.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> view = load_object("jug").view
@@ -160,7 +160,10 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at up to 1000 points [m], normalised. Raises as `predict`."""
+        """Return the joint posterior of distance and gradient, normalised, at up to 1000 points [m].
+
+        Raises the errors of `predict`.
+        """
         x = self._queries(points)
         if len(x) > MAX_JOINT:
             raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
@@ -170,7 +173,10 @@ class ShapeGP(Posterior, Normalisation):
     def sample(
         self, points: Float[Tensor, "k 3"], n: Annotated[int, Range(0, 1_000_000)], seed: Seed = 0
     ) -> Float[Tensor, "n k 4"]:
-        """Draw (d, w) jointly at up to 1000 points [m], n times, normalised. Raises as `predict`."""
+        """Draw n joint samples of distance and gradient, normalised, at up to 1000 points [m].
+
+        Raises the errors of `predict`.
+        """
         joint = self.joint(points.double())
         root = symmetric_root(joint.covariance, float(self.prior_block()[0, 0]), "query points within the domain")
         generator = torch.Generator().manual_seed(seed)
@@ -186,13 +192,13 @@ class ShapeGP(Posterior, Normalisation):
         noise: Positive = 0.001,
         normal_noise: Positive = 0.05,
     ) -> "ShapeGP":
-        """Return the shape given further points, too: a finger's touch, a second view.
+        """Return the shape given further surface points too, such as a finger's touch or a second view.
 
-        Equals the posterior of all observations at once. Kernel, domain and `cloud` do not change.
+        The result equals the posterior of all observations at once. Kernel, domain and `cloud` do not change.
 
         Args:
-            points: on the surface [m], in the cloud's frame.
-            normals: outward, of any length; None: unknown.
+            points: surface points [m] in the cloud's frame.
+            normals: outward normals of any length; None: unknown.
             noise: standard deviation of a point [m] along the normal.
             normal_noise: standard deviation of the components of a unit normal.
 
@@ -215,12 +221,12 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":
-        """Return the shape given further observations, normalised, with the same kernel and domain."""
+        """Return the shape given further normalised observations; kernel and domain do not change."""
         return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
 
     @checked
     def moved(self, b_from_a: Pose) -> "ShapeGP":
-        """Return the shape in frame b [m]; it is given in frame a. Its normalised frame is rotated, too."""
+        """Return the shape transformed from frame a to frame b [m]."""
         rotation, n = b_from_a[:3, :3].to(self.x), len(self.x)
 
         def turn(rows: Float[Tensor, "rows c"]) -> Float[Tensor, "rows c"]:
@@ -241,7 +247,7 @@ class ShapeGP(Posterior, Normalisation):
         )
 
     def _queries(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
-        """Return normalised query points as a list; refuse points outside the domain."""
+        """Return query points [m] as normalised points (q, 3); raise `BadArgument` for points outside the domain."""
         flat = points.detach().reshape(-1, 3)
         x = self.normalise(flat.double().to(self.device))
         radius = torch.linalg.vector_norm(x, dim=-1)
@@ -263,5 +269,5 @@ def _reshape(rows: Float[Tensor, "q *c"], points: Float[Tensor, "*b 3"]) -> Tens
 
 
 def _fields(value: Value, kind: type[Value]) -> dict[str, Any]:
-    """Return the fields of a value that a kind of value has."""
+    """Return those fields of a value that the class `kind` also has."""
     return {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]

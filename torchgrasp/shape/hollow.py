@@ -1,4 +1,4 @@
-"""An open vessel: an outer body, and the space within its inner surface cut out of it."""
+"""The shape of an open vessel: an outer body from which the space inside the inner surface is cut out."""
 
 import dataclasses
 from collections.abc import Callable
@@ -35,10 +35,10 @@ from torchgrasp.values import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class HollowShape(ShapeGP):
-    """The material between two surfaces, each with a posterior of its own: the distance is the greater one.
+    """The shape of an open vessel: the material between an outer and an inner surface, each a Gaussian process.
 
     A single smooth field cannot change its sign twice within a thin wall. At every point the surface with the greater
-    mean gives distance, normal and covariance. Errors of different surfaces are independent.
+    mean distance gives distance, normal and covariance. Errors of the two surfaces are independent.
 
     Args:
         inner: the inner surface, positive inside the vessel and negative around it.
@@ -58,14 +58,14 @@ class HollowShape(ShapeGP):
     @classmethod
     @checked
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
-        """Return the vessel of two surfaces in the same normalised frame; `cloud` is what was seen of both."""
+        """Return the vessel with two surfaces in the same normalised frame; `cloud` holds the seen points of both."""
         fields = {f.name: getattr(outer, f.name) for f in dataclasses.fields(ShapeGP)}
         fields |= {"cloud": cloud, "domain_radius": min(outer.domain_radius, inner.domain_radius)}
         return cls(**fields, inner=inner)
 
     @cached_property
     def outer(self) -> ShapeGP:
-        """The outer surface alone: the body as if it were full."""
+        """The outer surface alone, as if the vessel were solid."""
         return ShapeGP(**{f.name: getattr(self, f.name) for f in dataclasses.fields(ShapeGP)})
 
     @property
@@ -75,7 +75,7 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Return which wall is the surface at normalised points."""
+        """Return whether the outer or the inner surface applies at normalised points."""
         inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
 
@@ -92,22 +92,22 @@ class HollowShape(ShapeGP):
 
     @checked
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
-        """Return the mean and the covariance of (d, w) at normalised points."""
+        """Return mean and covariance of distance and gradient (d, w) at normalised points."""
         return self._by_wall(x, lambda wall, own: wall.estimate(own))  # pyright: ignore[reportReturnType]
 
     @checked
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return mean and variance with derivatives at normalised points."""
+        """Return mean and variance of the distance with derivatives, at normalised points."""
         return SurfaceJet(*self._by_wall(x, lambda wall, own: _fields(wall.jet(own))))
 
     @checked
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
-        """Return the mean with its derivatives at normalised points."""
+        """Return the mean distance with derivatives, at normalised points."""
         return MeanJet(*self._by_wall(x, lambda wall, own: _fields(wall.mean_jet(own))))
 
     @checked
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at normalised points."""
+        """Return the joint posterior of distance and gradient (d, w) at normalised points."""
         parts, owner = [wall.joint_at(x) for wall in self.walls], self.wall_at(x)
         mean = torch.where(owner[:, 1:], parts[1].mean, parts[0].mean)
         covariance = torch.zeros_like(parts[0].covariance)
@@ -117,20 +117,20 @@ class HollowShape(ShapeGP):
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
-        """Return the shape given further observations, normalised, each of the wall at its point."""
+        """Return the shape given further normalised observations; each belongs to the wall at its point."""
         outer, inner = self.wall_at(new.x).T
         return self.join(self.outer.append(new[outer]), self.inner.append(new[inner]), self.cloud)
 
     @checked
     def moved(self, b_from_a: Pose) -> "HollowShape":
-        """Return the shape in frame b [m]; it is given in frame a."""
+        """Return the shape transformed from frame a to frame b [m]."""
         outer = self.outer.moved(b_from_a)
         return self.join(outer, self.inner.moved(b_from_a), outer.cloud)
 
     def _by_wall(
         self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], tuple[Any, ...]]
     ) -> tuple[Tensor, ...]:
-        """Evaluate each wall where it is the surface."""
+        """Evaluate each wall at the points where it is the surface, and merge the results."""
         owner = self.wall_at(x)
         found: tuple[Tensor, ...] = ()
         for wall, own in zip(self.walls, owner.T, strict=True):
@@ -148,12 +148,12 @@ def _fields(jet: MeanJet) -> tuple[Tensor, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Middle(Value):
-    """Places amid the material of a vessel, normalised, and its thickness there.
+    """Points in the middle of a vessel's wall, normalised, and the wall's thickness.
 
     Args:
-        x: the places.
-        side: which are as thick as `thickness`; others are at least as thick.
-        thickness: of the wall, normalised.
+        x: the points.
+        side: points where the wall is exactly as thick as `thickness`; elsewhere it is at least as thick.
+        thickness: thickness of the wall, normalised.
     """
 
     x: Float[Tensor, "n 3"]
@@ -164,14 +164,14 @@ class Middle(Value):
 def vessel_supports(
     cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float, noise: float
 ) -> tuple[Support, Support, Middle]:
-    """Return what is observed of the outer and of the inner surface of a vessel, and the places between them.
+    """Return observations of a vessel's outer and inner surface besides the seen points, and points amid the wall.
 
-    Distances are negative in the material. So the inner surface's are positive around the axis, and negative outside.
+    Signed distances are negative in the material. So distances of the inner surface are positive around the axis.
 
     Args:
         cloud: the view [m] with normals, in float64.
-        vessel: found in it.
-        outline: of its views.
+        vessel: the vessel found in the view.
+        outline: outline of each view.
         table: the table's height [m].
         noise: standard deviation of an anchor's distance, normalised.
     """
@@ -216,10 +216,10 @@ def vessel_supports(
 
 
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
-    """Return the vessel with the known thickness of its wall.
+    """Return the vessel after adding observations that give its wall the known thickness.
 
-    Two independent posteriors let the surfaces touch, which tears holes. Amid the material the sum of both distances
-    is minus the thickness. Where it is not, the more certain surface gives an observation of the other one.
+    Two independent surfaces might touch, which tears holes into the wall. In the middle of the wall the two distances
+    must add up to minus the thickness. Elsewhere the more certain surface gives an observation of the other.
     """
     x, thickness, noise = middle.x, middle.thickness, 0.0007 / shape.scale
     for _ in range(3):
@@ -244,7 +244,7 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
 
 
 def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: Normalisation) -> Middle:
-    """Return places half a thickness behind both walls, without ears, handles and rim."""
+    """Return points half a thickness behind both walls, without handles and rim."""
     assert cloud.normals is not None
     points, normals = [], []
     for wall, seen in zip(walls, (vessel.body & ~vessel.inner, vessel.inner), strict=True):
@@ -259,6 +259,6 @@ def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: 
 
 
 def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
-    """Return hidden points with their shared errors."""
+    """Return observations of a wall's hidden points, and their correlated errors."""
     errors = correlated_errors(wall.points, wall.shared, FORM_ERROR)
     return observe(frame, wall.points, wall.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE), errors / frame.scale

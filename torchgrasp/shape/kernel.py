@@ -32,8 +32,9 @@ class Kernel:
 
     Args:
         profile: k(r).
-        diameter: of the ball, normalised, within which k is a covariance; infinite if it is a covariance everywhere.
-        remedy: what the error says when the covariance is not positive definite.
+        diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it is a covariance
+            everywhere.
+        remedy: the fix that the error suggests when the covariance is not positive definite.
         closed_form: a faster `differentiate` of this profile, called with `r` and `count`; None: autograd.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
@@ -71,7 +72,7 @@ def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple
 
 
 def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[Tensor]:
-    """Return the profile and its derivatives in r up to an order, elementwise."""
+    """Return the profile k(r) and its derivatives by r up to an order, elementwise."""
     with torch.enable_grad():
         r = r.detach().requires_grad_()
         values = [profile(r)]
@@ -104,7 +105,7 @@ def thin_plate_kernel(psi: Positive) -> Kernel:
 
 
 def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
-    """Return `differentiate` of the thin plate in closed form."""
+    """Return k and its derivatives by r^2 / 2 of the thin plate kernel in closed form, `count` in all."""
     values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6.0 * r).sub_(6.0 * psi)]
     if count > 2:
         inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
@@ -141,7 +142,7 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return the kernel "thin_plate", "matern52" or "rbf"; each has the prior variances psi^3 and 6 psi (slope).
+    """Return a kernel by name; all have the same prior variances, psi^3 of distance and 6 psi of slope.
 
     Raises:
         BadArgument: another name.
@@ -156,12 +157,13 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
 def cross_covariance(
     kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], n_oriented: int
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the covariance of each component of (d, w) at x with observations at y, Eqs. (2)-(5).
+    """Return the covariance of distance and gradient (d, w) at x with the observations at y, Eqs. (2)-(5).
 
     The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T. Here d = x - y, and k', k'' are derivatives in r^2 / 2.
     Eq. (5) takes one derivative in each argument: two in one argument would make the matrix indefinite.
 
-    The first `n_oriented` of y have normals. Columns go by component: d of all, then w1, w2, w3 of those with normals.
+    The first `n_oriented` of y have normals. Columns are ordered by component: d of all, then w1, w2, w3 of those with
+    normals.
     """
     n = len(y)
     d, r = separations(x, y)
@@ -186,7 +188,7 @@ def cross_covariance(
 
 
 def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
-    """Return the components of x - y and its length, without cancellation."""
+    """Return the three components of x - y for all pairs, and the distances |x - y|, without cancellation."""
     d = [x[:, m, None] - y[None, :, m] for m in range(3)]
     return d, (d[0] * d[0]).addcmul_(d[1], d[1]).addcmul_(d[2], d[2]).sqrt_()
 
@@ -194,7 +196,7 @@ def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[
 def covariance_rows(
     kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int, y: Float[Tensor, "m 3"], other_oriented: int
 ) -> Float[Tensor, "rows columns"]:
-    """Return the covariance of two lists of observations. Points with normals are first."""
+    """Return the covariance of two lists of observations; the first `n_oriented` or `other_oriented` have normals."""
     block = cross_covariance(kernel, x, y, other_oriented)
     if n_oriented == len(x):
         return block.flatten(0, 1)
@@ -202,5 +204,5 @@ def covariance_rows(
 
 
 def gram(kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int) -> Float[Tensor, "rows rows"]:
-    """Return the covariance of observations, of which the first `n_oriented` have normals."""
+    """Return the covariance matrix of observations, of which the first `n_oriented` have normals."""
     return covariance_rows(kernel, x, n_oriented, x, n_oriented)

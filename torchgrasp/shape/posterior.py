@@ -1,4 +1,4 @@
-"""The posterior in the normalised frame: mean, derivatives and covariances, Eqs. (7)-(8)."""
+"""The Gaussian process posterior in the normalised frame: mean, derivatives and covariances, Eqs. (7)-(8)."""
 
 import dataclasses
 from functools import cached_property, partial
@@ -16,9 +16,10 @@ from torchgrasp.shape.values import JointEstimate, MeanJet, SurfaceJet, pass_gra
 
 @dataclasses.dataclass(frozen=True)
 class Posterior(Value):
-    """A Gaussian process given observations of distances and normals; normalised, in float64.
+    """A Gaussian process given observed distances and normals; normalised, in float64.
 
-    `mean` and `mean_and_gradient` are differentiable once. All other methods refuse points that require a gradient.
+    `mean` and `mean_and_gradient` are differentiable once. All other methods refuse points that require a gradient. (d,
+    w) are signed distance and its gradient.
 
     Args:
         x: observed points, those with normals first.
@@ -45,7 +46,7 @@ class Posterior(Value):
 
     @cached_property
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """L^-T of the factor L in about four blocks of columns, without the zeros below."""
+        """Blocks of columns of L^-T, without the zeros below, for fast products with the factor L."""
         rows, tile = len(self.factor), 24  # matrix products are fastest with a multiple of so many columns
         one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)
         inverse = torch.linalg.solve_triangular(self.factor, one, upper=False)
@@ -59,12 +60,12 @@ class Posterior(Value):
 
     @checked
     def ordered(self, rows: Shaped[Tensor, "rows *c"]) -> Shaped[Tensor, "rows *c"]:
-        """Bring rows from the order of `gram` into that of the factor."""
+        """Return rows, given in the order of `gram`, in the order of the factor."""
         return rows if self.order is None else rows[self.order]
 
     @checked(gradients=True)
     def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
-        """Return the mean signed distance at normalised points; for grids of many points."""
+        """Return the mean signed distance at normalised points."""
 
         def evaluate(x: Tensor) -> tuple[Tensor]:
             a, b = self._split_weights()
@@ -119,7 +120,7 @@ class Posterior(Value):
 
     @checked
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return mean and variance with derivatives at normalised points, without autograd.
+        """Return mean and variance of the distance with their derivatives at normalised points, in closed form.
 
         (a, b) are the weights of distances and normals. With d = x - x_j, k', k'' and k''' are derivatives in
         |d|^2 / 2.
@@ -133,13 +134,13 @@ class Posterior(Value):
 
     @checked
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
-        """Return the mean's part of `jet`, which costs much less than the variance's."""
+        """Return the mean distance with its derivatives, which costs much less than `jet` with the variance."""
         size = 256 if x.device.type == "cpu" else 16384
         return MeanJet(*in_chunks(lambda part: _mean_jet(self, part)[0], x, size))
 
     @checked
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at normalised points, of any number, Eqs. (7)-(8)."""
+        """Return the joint posterior of (d, w) at any number of normalised points, Eqs. (7)-(8)."""
         k = len(x)
         cross = self.cross(x)
         mean = (cross @ self.weights).T
@@ -150,30 +151,30 @@ class Posterior(Value):
         return JointEstimate(mean, prior - whitened.T @ whitened)
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
-        """Return the prior covariance of (d, w) at any one point."""
+        """Return the prior covariance (4, 4) of (d, w) at any single point."""
         here = self.x.new_zeros(1, 3)
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
 
     @checked
     def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
-        """Return the covariance of the distances at points with the observations, the first block of `cross`."""
+        """Return the covariance of the distances at points with all observations, the first block of `cross`."""
         d, r = separations(x, self.x)
         k, first = self.kernel.derivatives(r, 2)
         return _distance_rows(d, k, first, self.n_oriented)
 
     @checked
     def whiten(self, rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
-        """Return covariances with the observations times L^-T: their products are what the observations explain."""
+        """Return covariances with the observations, times L^-T; products of results are explained covariances."""
         rows = rows if self.order is None else rows[:, self.order]
         return torch.cat([rows[:, : len(block)] @ block for block in self.whiteners], 1)
 
     @checked
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
-        """Return the covariance of (d, w) at points with the observations."""
+        """Return the covariance of (d, w) at points with all observations."""
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
     def _split_weights(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "near 3"]]:
-        """Return the weights of distances and of normals."""
+        """Return the weights of the observed distances, and of the observed normals."""
         n = len(self.x)
         return self.weights[:n], self.weights[n:].reshape(3, self.n_oriented).T
 
@@ -183,7 +184,7 @@ Kernels = tuple[list[Tensor], Float[Tensor, "q n"], Float[Tensor, "q n"], Float[
 
 
 def _mean_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
-    """Return the fields of `MeanJet` for one chunk, and the kernels for the variance."""
+    """Return the fields of `MeanJet` for one chunk of points, and kernel values that the variance needs."""
     known, (a, b) = posterior.x, posterior._split_weights()
     near = len(b)  # the points with normals come first
     d, r = separations(x, known)
@@ -205,7 +206,7 @@ def _mean_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[tuple[Tens
 
 
 def _jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return the fields of `SurfaceJet` for one chunk."""
+    """Return the fields of `SurfaceJet` for one chunk of points."""
     mean, (d, k, first, near_second) = _mean_jet(posterior, x)
     n, near = len(posterior.x), near_second.shape[1]
     near_d, near_first = [part[:, :near] for part in d], first[:, :near]
@@ -222,29 +223,29 @@ def _jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor,
 def _distance_rows(
     d: list[Tensor], k: Float[Tensor, "q n"], first: Float[Tensor, "q n"], near: int
 ) -> Float[Tensor, "q rows"]:
-    """Return k and -k' d, the latter of the first observations, which have normals."""
+    """Return the covariance of distances with the observations: k, then -k' d where normals are observed."""
     return torch.cat([k, *(-(part[:, :near] * first[:, :near]) for part in d)], 1)
 
 
 def _sum_differences(c: Float[Tensor, "q n"], x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> Float[Tensor, "q 3"]:
-    """Return sum_j c_j (x - y_j), by a matrix product."""
+    """Return sum_j c_j (x - y_j) for each point x, by a matrix product."""
     return x * c.sum(1, keepdim=True) - c @ y
 
 
 def _distances(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> Float[Tensor, "q n"]:
-    """Return distances without the cancellation of |x|^2 - 2 x.y + |y|^2."""
+    """Return the distances between all pairs of points, without cancellation."""
     return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
-    """Return the covariance of the distances within sets of normalised points, Eq. (8)."""
+    """Return the covariance (k, k) of the signed distances within each set of k normalised points, Eq. (8)."""
     return combined_covariance(posterior, x[:, :, None], x.new_ones(1, 1, 1, 1))
 
 
 def combined_covariance(
     posterior: Posterior, x: Float[Tensor, "b g p 3"], weights: Float[Tensor, "#b #g m p"]
 ) -> Float[Tensor, "b v v"]:
-    """Return the covariance, within sets, of m weighted sums of the distances of each group of p points: v = g m."""
+    """Return the covariance of weighted sums of distances: m sums for each of g groups of p points, v = g m."""
     (b, g, p), rows = x.shape[:3], len(posterior.factor)
     v, points = g * weights.shape[2], x.flatten(1, 2)
     cross = posterior.distance_rows(points.flatten(0, 1)).view(b, g, p, rows)
@@ -255,13 +256,14 @@ def combined_covariance(
     return torch.baddbmm(prior.reshape(b, v, v), whitened, whitened.mT, alpha=-1.0)
 
 
-def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, remedy: str) -> Float[Tensor, "*b k k"]:
-    """Return the symmetric root of covariances, unique even with equal eigenvalues.
+def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, fix: str) -> Float[Tensor, "*b k k"]:
+    """Return the symmetric square root of covariance matrices, unique even with equal eigenvalues.
 
-    Coinciding points leave eigenvalues of zero, which rounding makes negative. Negative eigenvalues far below the
-    `prior` variance count as zero. Others raise `IndefiniteCovariance` with the `remedy`.
+    Coinciding points give eigenvalues of zero, which rounding makes slightly negative: such eigenvalues count as zero.
+    Larger negative eigenvalues, relative to the `prior` variance, raise `IndefiniteCovariance`, whose message ends with
+    `fix`.
     """
     values, vectors = torch.linalg.eigh(covariance)
     if values.numel() and not float(values.min()) >= -1e-8 * prior:
-        raise IndefiniteCovariance("the joint covariance", float(values.min()), remedy)
+        raise IndefiniteCovariance("the joint covariance", float(values.min()), fix)
     return (vectors * torch.where(values > 0, values, 0.0).sqrt()[..., None, :]) @ vectors.mT

@@ -1,4 +1,4 @@
-"""What is observed of a surface beside the seen points: points inside and outside, the hidden side, free space."""
+"""Observations besides the seen points: points inside and outside, the hidden side, and free space."""
 
 import dataclasses
 
@@ -48,14 +48,14 @@ Part = tuple[Observations, Tensor | None]
 
 @dataclasses.dataclass(frozen=True)
 class Support(Value):
-    """The normalised frame of a surface, and what is observed beside the cloud.
+    """The normalised frame of a surface, and the observations besides the cloud.
 
     Args:
-        frame: to normalise with.
+        frame: normalised frame.
         anchors: points inside and outside, without normals.
         normal_noise: standard deviation of the cloud's normals.
-        std_factor: real deviations over the posterior's.
-        parts: points of the outline and of the hidden side.
+        std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
+        parts: observed points of the outline and of the hidden side.
         free: points of free space and least distances there, normalised; None: not used.
         rows: the points of the cloud that lie on this surface; None: all.
         kind: see `ShapeGP`.
@@ -72,7 +72,7 @@ class Support(Value):
 
 
 def paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> Support:
-    """Return the paper's support: the centre, and random points outside (Sec. 3.1)."""
+    """Return the paper's supporting observations: the centre, and random points outside (Sec. 3.1)."""
     center = seen.points.mean(0)
     scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
     sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(center)
@@ -85,18 +85,18 @@ def paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator)
 
 
 def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
-    """Return the frame with the centre of the points' box at 0 and the farthest point at distance 1."""
+    """Return the normalised frame of points: centre of their bounding box, farthest point at distance 1."""
     center = (points.amin(0) + points.amax(0)) / 2
     return Normalisation(center, float(torch.linalg.vector_norm(points - center, dim=-1).max()))
 
 
 def camera_support(seen: PreparedCloud, completion: Completion | None, noise: float, table: float | None) -> Support:
-    """Return metric distances; of a view also outline, hidden points and free space.
+    """Return supporting observations at metric distances; of a view also outline, hidden side and free space.
 
     Args:
         seen: the cloud.
-        completion: its hidden side; None: all sides were seen.
-        noise: standard deviation of the distance inside, normalised.
+        completion: the completed hidden side; None: all sides were seen.
+        noise: standard deviation of the distance observed inside, normalised.
         table: the table's height [m]; None: unknown.
     """
     hidden = seen.points[:0] if completion is None else completion.points.to(seen.points)
@@ -119,7 +119,7 @@ def camera_support(seen: PreparedCloud, completion: Completion | None, noise: fl
 
 
 def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[Part, ...]:
-    """Return points of the outline and of the hidden side as observations."""
+    """Return observations of points on the outline and on the hidden side."""
     outline = completion.outline
     hidden = observe(frame, completion.points, completion.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE)
     tilt = (completion.asymmetry / PART).to(frame.center)  # slope of a field with that deviation and length
@@ -131,7 +131,7 @@ def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[P
 def observe(
     frame: Normalisation, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], noise: float, normal_noise: float
 ) -> Observations:
-    """Return observations of points [m] of the surface with a noise [m]."""
+    """Return observations of surface points [m] with normals; `noise` [m] is along the normal."""
     x = frame.normalise(points.to(frame.center))
     return on_surface(x, normals.to(x), torch.full_like(x[:, 0], noise / frame.scale), normal_noise)
 
@@ -139,10 +139,10 @@ def observe(
 def free_space(
     outline: Outlines, frame: Normalisation, table: float | None = None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return points of free space and their least signed distance, both normalised.
+    """Return points in free space and lower bounds of their signed distance, both normalised.
 
-    The points lie beside the outline and below the table of this height [m]. The distances are lower bounds: observed
-    everywhere, they would inflate the object to its visual hull.
+    The points lie beside the object's outline, and below the table of height `table` [m]. A bound becomes an
+    observation only where the shape violates it: otherwise the shape would inflate to its visual hull.
     """
     origin, scale = frame.center.double().cpu(), frame.scale
     points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
@@ -160,7 +160,7 @@ def free_space(
 
 
 def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[Tensor, "n"]) -> Tensor:
-    """Return at most 16 rows of free space that the shape reaches into by 2 mm, the worst first."""
+    """Return the indices of at most 16 free-space points that lie 2 mm or more inside the shape, the worst first."""
     short = shape.mean(x) - least
     rows = torch.nonzero(short < -0.002 / shape.scale)[:, 0]
     rows = rows[torch.argsort(short[rows], stable=True)]
@@ -168,7 +168,7 @@ def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[
 
 
 def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 3"]:
-    """Return points [m] on rays 8 and 16 mm beside an outline, over the object's depth."""
+    """Return points [m] on camera rays 8 and 16 mm outside the outline, over the object's depth."""
     depth = float(outline.depth[outline.depth > 0].median())  # 0 beyond the image
     rays = [_rays_beside(outline, offset / depth) for offset in (0.008, 0.016)]
     middle = float((origin - outline.viewpoint) @ outline.axes[2])
@@ -177,7 +177,7 @@ def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float
 
 
 def _rays_beside(outline: Silhouette, offset: float) -> Float[Tensor, "k 3"]:
-    """Return 32 rays at an offset from the outline, in the camera's frame and up to depth 1."""
+    """Return 32 camera rays at an offset outside the outline, in the camera's frame at depth 1."""
     near = (outline.outside - offset).abs() <= 0.75 * outline.cell
     row, column = torch.nonzero(near, as_tuple=True)
     position = outline.corner + outline.cell * torch.stack([column, row], -1).double()

@@ -1,4 +1,4 @@
-"""The zero level of the shape, Eq. (9): a triangle mesh of it, and Newton steps onto it."""
+"""The estimated surface: the zero level of the mean distance, Eq. (9), as a triangle mesh or a distance field."""
 
 import dataclasses
 import itertools
@@ -49,7 +49,7 @@ class Surface(Value):
     std_m: Float[Tensor, "v"]
 
     def mesh(self) -> "trimesh.Trimesh":
-        """Return vertices and faces as a mesh."""
+        """Return vertices and faces as a trimesh mesh."""
         import trimesh
 
         return trimesh.Trimesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy(), process=False)
@@ -58,9 +58,10 @@ class Surface(Value):
 @checked
 @single_threaded
 def extract_surface(shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = RESOLUTION) -> Surface:
-    """Return the zero level of the mean, Eq. (9), within the domain, by marching cubes and Newton steps.
+    """Return the zero level of the mean distance, Eq. (9), within the domain, by marching cubes and Newton steps.
 
-    `resolution` counts cells along the domain's diameter. Sheets near less than 2 % of the cloud are left out.
+    `resolution` is the number of cells along the domain's diameter. Separate pieces near less than 2 % of the cloud are
+    left out.
 
     Raises:
         BadArgument: a resolution outside [8, 256], or a mean without zero level.
@@ -80,27 +81,27 @@ def extract_surface(shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = 
 
 @dataclasses.dataclass(frozen=True)
 class Mesh(Value):
-    """Vertices and faces of a `Surface` alone: normals and variance cost half of its time."""
+    """Vertices [m] and faces of the estimated surface, without normals and variance."""
 
     vertices: Float[Tensor, "v 3"]
     faces: Int[Tensor, "f 3"]
 
 
 def extract_mesh(shape: ShapeGP) -> Mesh:
-    """Return the mesh of `extract_surface` at its usual resolution."""
+    """Return the estimated surface as a mesh, at the default resolution."""
     x, faces = zip(*_trace_walls(shape, RESOLUTION), strict=True)
     return Mesh(shape.metres(torch.cat(x)), torch.cat(faces))
 
 
 def _trace_walls(shape: ShapeGP, resolution: int) -> list[tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]]:
-    """Return normalised vertices of each wall, and faces that count the vertices of all."""
+    """Return the vertices (normalised) of each wall, and faces whose indices count the vertices of all walls."""
     walls = [_trace_wall(shape, i, resolution) for i in range(len(shape.walls))]
     before = [0, *itertools.accumulate(len(x) for x, _ in walls)]
     return [(x, faces + n) for (x, faces), n in zip(walls, before, strict=False)]
 
 
 def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
-    """Return normalised vertices and faces of one wall of a shape, cut off where it leaves the material."""
+    """Return vertices (normalised) and faces of one wall, cut off where the wall leaves the material."""
     from skimage.measure import marching_cubes
 
     shape, others = whole.walls[number], [wall for i, wall in enumerate(whole.walls) if i != number]
@@ -135,10 +136,10 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
 
 
 def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
-    """Return the mean on a grid from -radius on along each axis, NaN outside the ball.
+    """Return the mean distance on a grid from -radius along each axis; NaN outside the ball.
 
-    Blocks of cells are halved where the zero level may pass. Other nodes copy the value of a node nearby; only its
-    sign is used.
+    Only blocks of cells that the zero level may cross are refined. Other nodes copy a neighbour's value, of which only
+    the sign is used.
     """
     line = -radius + step * torch.arange(cells + 1, dtype=torch.float64, device=shape.x.device)
 
@@ -163,7 +164,7 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
 
 
 def _least_corner(values: np.ndarray) -> np.ndarray:
-    """Return the least value at the corners of each cell of a grid."""
+    """Return the least value over the corners of each grid cell."""
     for axis in range(3):
         along = np.moveaxis(values, axis, 0)
         values = np.moveaxis(np.minimum(along[1:], along[:-1]), 0, axis)
@@ -171,7 +172,7 @@ def _least_corner(values: np.ndarray) -> np.ndarray:
 
 
 def _touched(cells: np.ndarray) -> np.ndarray:
-    """Return which nodes of a grid are corners of cells."""
+    """Return which grid nodes are corners of the given cells."""
     nodes = np.pad(cells, 1)
     for axis in range(3):
         along = np.moveaxis(nodes, axis, 0)
@@ -185,12 +186,12 @@ def newton_step(
     direction: Float[Tensor, "n 3"],
     least_slope: float = 0.0,
 ) -> Float[Tensor, "n"]:
-    """Return the Newton step onto the zero level, as a multiple of `direction`. Slopes are at least `least_slope`."""
+    """Return the Newton step to the zero level, as a multiple of `direction`; slopes are at least `least_slope`."""
     return -value / (gradient * direction).sum(-1).clamp_min(least_slope)
 
 
 def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
-    """Return which faces belong to sheets near enough of the cloud."""
+    """Return which faces belong to connected pieces that lie near enough cloud points."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
@@ -207,7 +208,7 @@ def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.n
 @checked
 @single_threaded
 def surface_field(shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING) -> SignedDistanceField:
-    """Return the signed distance field of a shape's estimated surface, for localization by touch.
+    """Return the signed distance field of a shape's estimated surface, to locate the object by touch.
 
     The nodes are `spacing` [m] apart.
 

@@ -1,4 +1,4 @@
-"""The values of a shape: its frame, what is observed of it, and what is estimated of it."""
+"""Value classes of a shape: its normalised frame, its observations and its estimates."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from torchgrasp.geometry.linalg import unit
 
 @dataclasses.dataclass(frozen=True)
 class Normalisation(Value):
-    """A frame without units: points [m] minus `center` [m], divided by `scale` [m].
+    """A normalised frame without units: points [m] minus `center` [m], divided by `scale` [m].
 
     >>> frame = Normalisation(torch.tensor([0.0, 0.0, 0.1]), scale=0.05)
     >>> frame.normalise(torch.tensor([0.0, 0.0, 0.15])), frame.metres(torch.tensor([0.0, 0.0, 1.0]))
@@ -39,7 +39,7 @@ class Normalisation(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Observations(Batch):
-    """Observed signed distances at points, and observed normals where `has_normal`; all is normalised.
+    """Observed signed distances at points, and observed normals where `has_normal`; all normalised.
 
     The noises are standard deviations.
 
@@ -58,7 +58,7 @@ class Observations(Batch):
     normal_noise: Float[Tensor, "n"]
 
     def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return the observed numbers and their noise variances: distances, then normals by component."""
+        """Return all observed numbers and their noise variances: distances first, then normals by component."""
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
         return y, noise * noise
@@ -69,20 +69,20 @@ class Observations(Batch):
         return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).min())
 
     def with_normals_first(self) -> "Observations":
-        """Return the observations, those with normals first."""
+        """Return the observations reordered: those with normals first."""
         return self[torch.argsort(~self.has_normal, stable=True)]
 
 
 def on_surface(
     x: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normal_noise: float
 ) -> Observations:
-    """Return observations of points on the surface with their normals."""
+    """Return observations of points on the surface (distance 0) with their normals."""
     yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
     return Observations(x, torch.zeros_like(noise), normals, yes, noise, torch.full_like(noise, normal_noise))
 
 
 def off_surface(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: float) -> Observations:
-    """Return observations of points off the surface, without normals."""
+    """Return observations of signed distances at points off the surface, without normals."""
     no = torch.zeros(len(x), dtype=torch.bool, device=x.device)
     sigma = torch.full_like(distance, noise)
     return Observations(x, distance, torch.zeros_like(x), no, sigma, sigma)
@@ -90,7 +90,7 @@ def off_surface(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: fl
 
 @dataclasses.dataclass(frozen=True)
 class MeanJet(Batch):
-    """The posterior mean with its first and second derivatives; gradients do not have unit length."""
+    """The posterior mean distance with first and second derivatives; gradients need not have unit length."""
 
     distance: Float[Tensor, "*b"]
     gradient: Float[Tensor, "*b 3"]
@@ -103,14 +103,14 @@ class MeanJet(Batch):
 
     @property
     def normal_jacobian(self) -> Float[Tensor, "*b 3 3"]:
-        """The derivatives of the normals by their points, (1 - n n^T) H / |g|."""
+        """The derivatives of the normals by the points, (1 - n n^T) H / |g|."""
         n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
         return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
 
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceJet(MeanJet):
-    """The mean to second order, and the variance of the distance to first order."""
+    """The mean distance to second order, and the variance of the distance to first order."""
 
     variance: Float[Tensor, "*b"]
     variance_gradient: Float[Tensor, "*b 3"]
@@ -118,10 +118,9 @@ class SurfaceJet(MeanJet):
 
 @dataclasses.dataclass(frozen=True)
 class JointEstimate(Value):
-    """The joint posterior of (d, w) at k points, point by point and normalised.
+    """The joint posterior of distance and gradient (d, w) at k points, normalised, ordered by point.
 
-    The gradient w does not have unit length. Points i and j have the block
-    `covariance.reshape(k, 4, k, 4)[i, :, j]`.
+    The gradient w need not have unit length. Points i and j have the block `covariance.reshape(k, 4, k, 4)[i, :, j]`.
     """
 
     mean: Float[Tensor, "k 4"]
@@ -139,7 +138,7 @@ class ShapeDerivatives(Value):
 
 
 def surface_deviation(variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the standard deviation of the surface along its normal, to first order in that of the distance."""
+    """Return the standard deviation of the surface along its normal, linearised from the distance's variance."""
     return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)
 
 
@@ -148,9 +147,9 @@ def pass_gradients(
     evaluate: Callable[[Tensor], tuple[Tensor, ...]],
     differentiate: Callable[[Tensor], tuple[Tensor, ...]],
 ) -> tuple[Tensor, ...]:
-    """Return outputs (*b, ...) of points; if these require a gradient, with the given derivatives (*b, ..., 3).
+    """Return `evaluate(x)`; autograd uses the derivatives (*b, ..., 3) that `differentiate(x)` gives.
 
-    Second derivatives are refused.
+    Second derivatives raise an error.
     """
     if not (x.requires_grad and torch.is_grad_enabled()):
         return evaluate(x)
@@ -159,7 +158,7 @@ def pass_gradients(
 
 
 class _Known(torch.autograd.Function):
-    """Outputs, and their known derivatives by the points."""
+    """An autograd function with known derivatives by the points."""
 
     @staticmethod
     def forward(x: Tensor, evaluate: Any, differentiate: Any) -> tuple[Tensor, ...]:
@@ -184,7 +183,7 @@ class _Known(torch.autograd.Function):
 
 
 class _Final(torch.autograd.Function):
-    """A gradient by the points that refuses to be differentiated by them."""
+    """An autograd function for a gradient that cannot be differentiated again."""
 
     generate_vmap_rule = True
 

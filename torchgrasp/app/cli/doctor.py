@@ -30,7 +30,7 @@ class Finding(NamedTuple):
 
     part: str
     found: str
-    remedy: str = ""
+    fix: str = ""
 
 
 @arguments()
@@ -45,9 +45,9 @@ class Doctor(Command):
         """Print what was found."""
         findings = find_parts()
         print(format_columns([(x.part, x.found) for x in findings], left={0, 1}))
-        missing = [x for x in findings if x.remedy]
+        missing = [x for x in findings if x.fix]
         for x in missing:
-            print(f"\n{x.part}: {x.remedy}")
+            print(f"\n{x.part}: {x.fix}")
         print("\neverything is installed; `torchgrasp selftest` tries it" if not missing else "")
         return 1 if missing else 0
 
@@ -80,10 +80,10 @@ class Selftest(Command):
         """Lift, compare and print."""
         from torchgrasp.evaluation.golden import GOLDEN, GoldenResult, run_golden
 
-        faults: dict[Simulator, str] = {name: _simulator(name).remedy for name in SIMULATORS}
-        for name, remedy in faults.items():
-            if remedy:
-                print(f"{name}: {remedy}")
+        faults: dict[Simulator, str] = {name: _simulator(name).fix for name in SIMULATORS}
+        for name, fix in faults.items():
+            if fix:
+                print(f"{name}: {fix}")
         found: dict[Simulator, list[GoldenResult]] = {name: [] for name in SIMULATORS if not faults[name]}
         if not found:
             return 1
@@ -108,19 +108,19 @@ def _verdict(held: bool) -> str:
     return "held" if held else "lost"
 
 
-def _package(name: str, remedy: str = "pip install torchgrasp") -> Finding:
+def _package(name: str, fix: str = "pip install torchgrasp") -> Finding:
     """Return the version of a package."""
     try:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
-        return Finding(name, "missing", remedy)
+        return Finding(name, "missing", fix)
 
 
 def _option(name: str) -> Finding:
     """Return the version of a package that only one command needs; a missing one is no fault."""
     extra, command = OPTIONAL[name]
     found = _package(name)
-    return found if not found.remedy else Finding(name, f"none; {command} needs it: pip install 'torchgrasp[{extra}]'")
+    return found if not found.fix else Finding(name, f"none; {command} needs it: pip install 'torchgrasp[{extra}]'")
 
 
 def _gpu() -> Finding:

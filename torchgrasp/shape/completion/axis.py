@@ -1,7 +1,7 @@
-"""Bodies of revolution: their axis is the line that the normals of most points meet.
+"""Bodies of revolution: their axis is the line that most surface normals meet.
 
 The lines along the normals of a surface of revolution meet its axis: they lie in a linear line complex of pitch 0
-(Pottmann and Wallner, Computational Line Geometry, 2001). A miss, moment times direction, is linear in each of the two.
+(Pottmann and Wallner, Computational Line Geometry, 2001). The miss, moment times direction, is linear in either factor.
 """
 
 import dataclasses
@@ -37,10 +37,10 @@ class Revolution:
 
 
 def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution] | None:
-    """Return the frame of an axis of revolution, and the body about its z axis; None: there is none.
+    """Return the frame of an axis of revolution, and the body about its z axis; None: there is no axis.
 
-    The frame is `axis_from_cloud`; its x axis points towards the cameras. The axis is fitted to the scorer's probes.
-    The body rotated about it must keep out of free space and of the table.
+    The frame is `axis_from_cloud`; its x axis points towards the cameras. The axis is fitted to the scorer's probe
+    points. The body, rotated about the axis, must stay out of free space and above the table.
     """
     center, direction, cost = _fit_axis(scorer.probes, scorer.probe_normals)
     if not cost < MAX_COST:
@@ -63,7 +63,7 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
 
 def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Revolution | None:
-    """Return the upright body of revolution that most points belong to; None: there is none."""
+    """Return the upright body of revolution to which most points belong; None: there is none."""
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
     body = _split_body(points, lines, center)
@@ -72,13 +72,16 @@ def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
 
 
 def fit_axis(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "2"]:
-    """Return the vertical axis [m] that most lines along the normals meet."""
+    """Return the vertical axis, as a point (2,) [m], that most lines along the normals meet."""
     return _fit_to_lines(points, _lines_from_above(points, normals))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Lines:
-    """The lines across . x = offset along normals: their level part `slope` is steep, and of unit length `level`."""
+    """Lines along normals, seen from above: the points x with across . x = offset.
+
+    `slope` is the length of a normal's horizontal part, `level` its unit direction, `steep` whether it is long enough.
+    """
 
     slope: Float[Tensor, "n"]
     steep: Bool[Tensor, "n"]
@@ -88,7 +91,7 @@ class _Lines:
 
 
 def _lines_from_above(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> _Lines:
-    """Return the lines along the normals, seen from above."""
+    """Return the lines along the normals of points, seen from above."""
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     steep = slope > STEEP
     level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)
@@ -97,7 +100,7 @@ def _lines_from_above(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"
 
 
 def _fit_to_lines(points: Float[Tensor, "n 3"], lines: _Lines) -> Float[Tensor, "2"]:
-    """Return the point that most lines meet; reweighted least squares (Cauchy)."""
+    """Return the point (2,) that most lines meet, by reweighted least squares (Cauchy)."""
     miss, center = torch.zeros_like(lines.offset), points[:, :2].mean(0)
     for _ in range(30):
         weight = lines.slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
@@ -108,10 +111,10 @@ def _fit_to_lines(points: Float[Tensor, "n 3"], lines: _Lines) -> Float[Tensor, 
 
 @dataclasses.dataclass(frozen=True)
 class _Body:
-    """The part of a cloud about a vertical axis: `mask` of all its points, `side` of those with steep normals.
+    """The part of a cloud that is a body about a vertical axis: `mask` of all its points, `side` of those on its side.
 
-    Each point has the distance [m] by which its normal's line misses the axis, its radius, and that of its slice. The
-    mean level normal of the side has the length `one_way`.
+    For each point: `miss` [m] of its normal's line from the axis, its `radius`, and the `typical` radius at its height.
+    `one_way` is the length of the side's mean horizontal normal.
     """
 
     mask: Bool[Tensor, "n"]
@@ -122,12 +125,12 @@ class _Body:
     one_way: Float[Tensor, ""]
 
     def is_round(self, fits: Bool[Tensor, ""]) -> bool:
-        """Return whether the body is most of the cloud, fits, and is no flat side."""
+        """Return whether the body is most of the cloud, fits a surface of revolution, and is not a flat side."""
         return bool((self.mask.double().mean() > BODY_SHARE) & fits & (self.one_way < 0.95))
 
 
 def _split_body(points: Float[Tensor, "n 3"], lines: _Lines, center: Float[Tensor, "2"]) -> _Body:
-    """Return the points whose normals meet the vertical axis at `center`, and whose radius is that of their slice."""
+    """Return the body about a vertical axis: points whose normals meet the axis and whose radius fits their height."""
     miss = lines.offset - lines.across @ center
     radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
     meets = lines.steep & (miss.abs() / radius.clamp_min(LEAST_RADIUS) < MISS)
@@ -142,9 +145,9 @@ def _split_body(points: Float[Tensor, "n 3"], lines: _Lines, center: Float[Tenso
 def _fit_axis(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], float]:
-    """Return a point of the axis [m] that most lines along the normals meet, its direction and its cost.
+    """Return a point [m] of the axis that most lines along the normals meet, the axis direction, and the cost.
 
-    Gauss-Newton steps with weights (Cauchy) from several directions at once. Each step narrows the weights.
+    Gauss-Newton steps with robust weights (Cauchy) from several directions at once; each step narrows the weights.
     """
     starts = 12
     direction = fibonacci_sphere(2 * starts)[:starts]
@@ -173,7 +176,7 @@ def _fit_axis(
 
 
 def _across(direction: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
-    """Return two unit vectors at right angles to each direction and to each other."""
+    """Return two unit vectors perpendicular to each direction and to each other."""
     helper = torch.zeros_like(direction).scatter(-1, direction.abs().argmin(-1, keepdim=True), 1.0)
     first = unit(torch.linalg.cross(direction, helper))
     return first, torch.linalg.cross(direction, first)
@@ -190,7 +193,7 @@ def _frame(center: Float[Tensor, "3"], direction: Float[Tensor, "3"], outline: O
 
 
 def _turn(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
-    """Return points rotated about z by multiples of 30 degrees."""
+    """Return the points rotated about z by all multiples of 30 degrees."""
     angle = 2 * math.pi / 12 * torch.arange(1, 12, dtype=torch.float64)
     x, y, z = points.unbind(1)
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]

@@ -1,4 +1,4 @@
-"""The hidden side as the mirror image of the visible one."""
+"""Completion of the hidden side by mirror images of the visible side."""
 
 import dataclasses
 import math
@@ -44,17 +44,18 @@ Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "
 
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
-    """Points of the hidden side, with normals. Errors of nearby points are correlated: they do not average out.
+    """Estimated points of the hidden side, with normals and correlated errors.
 
-    The errors along the normals have the covariance LEAST_NOISE^2 I + D D^T [m^2]. The columns of D (`deviations`) are
-    errors of the mirror planes, and a smooth field of length scale `PART`, the asymmetry of the object.
+    The errors along the normals have the covariance LEAST_NOISE^2 I + D D^T [m^2]; errors of nearby points do not
+    average out. The columns of D (`deviations`) are errors of the mirror planes, and a smooth field of length scale
+    `PART`, the asymmetry of the object.
 
     Args:
-        shared: standard deviations [m] of the errors by plane.
+        shared: standard deviations [m] of the errors that each mirror plane causes.
         asymmetry: standard deviation [m] of the smooth field.
         planes: the planes n.x = o that were used, as (n, o), the best of each part first.
-        scores: of the planes: 1 if the mirror image is on the cloud, near 0 without support.
-        kind: what the points follow from, by which the bands are calibrated.
+        scores: score of each plane: 1 if the mirror image lies on the cloud, near 0 without support.
+        kind: how the hidden side was completed, which selects the calibration.
     """
 
     points: Float[Tensor, "m 3"]
@@ -68,7 +69,7 @@ class Completion(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Completion":
-        """Return the completion in frame b; it is given in frame a."""
+        """Return the completion transformed from frame a to frame b."""
         normals = rotate(b_from_a, self.planes[:, :3])
         planes = torch.cat([normals, self.planes[:, 3:] + normals @ b_from_a[:3, 3:]], 1)
         points, turned = apply(b_from_a, self.points), rotate(b_from_a, self.normals)
@@ -77,9 +78,9 @@ class Completion(Value):
 
     @property
     def deviations(self) -> Float[Tensor, "m k"]:
-        """Correlated errors [m], a column for each independent cause.
+        """The correlated errors D [m], one column for each independent cause.
 
-        The errors by plane are local, too: they also count in the smooth field.
+        Errors of the mirror planes also vary locally, so they count in the smooth field too.
         """
         return correlated_errors(self.points, self.shared, self.asymmetry)
 
@@ -87,9 +88,9 @@ class Completion(Value):
 def correlated_errors(
     points: Float[Tensor, "m 3"], shared: Float[Tensor, "m c"], local: Float[Tensor, "m"] | float
 ) -> Float[Tensor, "m k"]:
-    """Return errors [m], a column for each independent cause: the shared ones, and a smooth field of length `PART`.
+    """Return the error columns [m] of independent causes: the shared errors, and a smooth field of length `PART`.
 
-    The field has the deviation of the local and of the shared errors.
+    The field has the combined standard deviation of the local and the shared errors.
     """
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
     alike = torch.exp(-0.5 * (torch.cdist(points, points) / PART) ** 2)
@@ -98,16 +99,16 @@ def correlated_errors(
 
 @checked
 def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count = 50) -> Completion:
-    """Return the hidden side that the cloud's symmetry suggests, with its uncertainty.
+    """Return points of the hidden side, from the cloud's symmetry, with their uncertainty.
 
-    The cloud is mirrored across its best planes and across pairs of them. Points of better planes come first. No view
-    may exclude a point, and no other point may be near. Low scores mean large asymmetry.
+    The cloud is mirrored across its best planes and across pairs of them; images in better planes come first. A point
+    is kept if no view excludes it and no other point is near. Low scores mean a large asymmetry.
 
-    A body of revolution and its attached part are mirrored separately, in the frame of the axis. Any plane through the
-    axis explains the body. The plane of a handle follows from the part alone.
+    A body of revolution and a part attached to it, such as a handle, are mirrored separately, in the frame of the axis.
+    Any plane through the axis mirrors the body. The attached part alone determines its own plane.
 
-    The cloud is clean, with outward normals and viewpoints; others raise `BadArgument`. The table has its height [m]
-    and normal z.
+    The cloud must be clean, with outward normals and viewpoints, or `BadArgument` is raised. `table` is the height [m]
+    of a table with normal z.
     """
     if cloud.normals is None or cloud.viewpoint is None:
         raise BadArgument("cloud", "no normals or no viewpoint", "outward normals and viewpoints: see prepare_cloud")
@@ -134,13 +135,13 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
 
 
 def _nothing(scorer: SymmetryScorer) -> Completion:
-    """Return no hidden side: the posterior alone guesses it."""
+    """Return a completion without points, for an object that the image border cuts off."""
     none, planes = scorer.points[:0], scorer.points.new_zeros(0, 4)
     return Completion(none, none, none[:, :0], none[:, 0], planes, planes[:, 0], scorer.outline, "cut off")
 
 
 def _hidden_side(scorer: SymmetryScorer, ball: Ellipsoid, budget: int) -> Completion:
-    """Return the hidden side of an ellipsoid. What the seen side misses it by, the hidden side may miss it by."""
+    """Return the hidden side of an ellipsoid; its error is at least the misfit of the seen side."""
     distance, _ = scorer.nearest(ball.points)
     rows = torch.nonzero((distance > NEW) & _allowed(scorer, ball.points))[:, 0]
     rows = rows[farthest_points(ball.points[rows], budget, tie=TIE)]
@@ -153,7 +154,7 @@ def _hidden_side(scorer: SymmetryScorer, ball: Ellipsoid, budget: int) -> Comple
 
 @dataclasses.dataclass(frozen=True)
 class _Part:
-    """Points of the cloud with the same mirror planes."""
+    """A part of the cloud, with its own mirror planes and their scores."""
 
     scorer: SymmetryScorer
     rows: Tensor
@@ -163,10 +164,10 @@ class _Part:
 
 @dataclasses.dataclass(frozen=True)
 class _Image(Batch):
-    """A mirrored part [m]; its score is infinite before any mirror.
+    """The mirror image of a part [m], with its score and errors; the score is infinite for the part itself.
 
-    `variance` [m^2] is the asymmetry's. `shared` [m] is a point's motion with each nearby plane, weighted by the
-    root of the plane's probability.
+    `variance` [m^2] is due to asymmetry. `shared` [m] is the shift of each point when the mirror is replaced by a
+    nearby plane, weighted by the root of the plane's probability.
     """
 
     points: Tensor
@@ -177,14 +178,14 @@ class _Image(Batch):
 
     @classmethod
     def of(cls, scorer: SymmetryScorer, rows: Tensor, n_planes: int) -> "_Image":
-        """Return points of the cloud, without error."""
+        """Return points of the cloud as an image without errors."""
         points = scorer.points[rows]
         near = NEARBY ** (2 if scorer.upright else 3)
         shared = points.new_zeros(len(rows), n_planes, near)
         return cls(points, scorer.normals[rows], math.inf, torch.zeros_like(points[:, 0]), shared)
 
     def with_rim(self, outline: Outlines) -> "_Image":
-        """Return the points and those of the outline. Their images are edges of the far side: flat sides bulge less."""
+        """Return the points together with those of the outline, whose images are edges of the far side."""
         rim = outline.rim
         shared = rim.new_zeros(len(rim), *self.shared.shape[1:])
         return join([self, _Image(rim, outline.rim_normals, math.inf, torch.zeros_like(rim[:, 0]), shared)])
@@ -192,7 +193,7 @@ class _Image(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class _Mirror:
-    """A plane, its number and score, and nearby planes with their probabilities."""
+    """A mirror plane with its number and score, and nearby planes with their probabilities."""
 
     number: int
     plane: Tensor
@@ -208,7 +209,7 @@ class _Mirror:
         return cls(number, plane, float(score), near, torch.softmax(scorer.score(near)[0] / TEMPERATURE, 0))
 
     def image(self, of: _Image) -> _Image:
-        """Return the mirror image of an image."""
+        """Return the mirror image of points or of another image."""
         points, normals = reflect(of.points, self.plane), reflect_directions(of.normals, self.plane)
         shift = ((reflect(of.points, self.near[:, None]) - points) * normals).sum(-1)
         shared = of.shared.clone()  # a mirror leaves errors across the surface as they are
@@ -219,7 +220,7 @@ class _Mirror:
 
 
 def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]:
-    """Split the cloud into a body of revolution and its attached part, if it is one."""
+    """Split the cloud into parts: a body of revolution and what is attached to it, or the whole cloud."""
     every = torch.arange(len(scorer.points))
     if revolution is None:
         return [_Part(scorer, every, *find_planes(scorer))]
@@ -233,7 +234,7 @@ def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]
 
 
 def _mirror(parts: list[_Part]) -> list[_Image]:
-    """Return the images of each part across each plane and across pairs of planes."""
+    """Return the mirror images of each part, in each plane and in pairs of planes."""
     total, images, before = sum(len(part.planes) for part in parts), [], 0
     for part in parts:
         original = _Image.of(part.scorer, part.rows, total)
@@ -251,7 +252,7 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
 
 
 def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Image:
-    """Add the allowed points of images to `merged`, at least `SPACING` apart."""
+    """Add to `merged` the points of images that are allowed, at least `SPACING` apart."""
     from scipy.spatial import KDTree
 
     for image in images:
@@ -265,21 +266,21 @@ def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Ima
 
 
 def _allowed(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return which points neither a view nor the table excludes."""
+    """Return which points are excluded neither by a view nor by the table."""
     outline = scorer.outline
     allowed = (outline.hull_distance(points) < HULL_MARGIN) & (outline.violation(points) < FRONT_MARGIN)
     return allowed if scorer.table is None else allowed & (scorer.table.height(points) > -FRONT_MARGIN)
 
 
 def _on_table(scorer: SymmetryScorer, image: _Image) -> Bool[Tensor, "n"]:
-    """Return which points are on the face on the table, which free space bounds already."""
+    """Return which points of an image are on the face on the table, where free space already bounds the shape."""
     if scorer.table is None:
         return torch.zeros(len(image), dtype=torch.bool)
     return (scorer.table.height(image.points) < 0.004) & (image.normals @ scorer.table.normal < -0.7)
 
 
 def _thin(points: Float[Tensor, "n 3"]) -> Tensor:
-    """Return the indices of points at least `SPACING` apart, in their order."""
+    """Return the indices of points that are at least `SPACING` apart, earlier points first."""
     apart = (torch.cdist(points, points) >= SPACING).numpy()  # NumPy's calls cost a quarter of torch's
     keep = np.ones(len(points), dtype=bool)
     for i in range(len(points)):

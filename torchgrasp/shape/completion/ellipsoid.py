@@ -1,7 +1,7 @@
-"""Balls and fruit: an ellipsoid, nearly a ball, that fits the whole cloud.
+"""Balls and fruit: an ellipsoid, nearly a ball, is fitted to the whole cloud.
 
-Every plane through the centre of a ball explains it, so planes do not determine its depth. The fit does: it uses
-the normals, the outline and the table, and its covariance is the uncertainty.
+Every plane through the centre of a ball is a mirror plane, so mirror planes do not determine its depth. The ellipsoid
+does: the fit uses normals, outline and table, and its covariance gives the uncertainty.
 """
 
 import dataclasses
@@ -32,9 +32,9 @@ class Ellipsoid:
     """An ellipsoid fitted to a cloud.
 
     Args:
-        points, normals: spread over the whole of it [m].
-        deviations: motion [m] of each point along its normal, a column for each independent cause.
-        misfit: RMS distance [m] of the cloud from it.
+        points, normals: points [m] and normals spread over the whole ellipsoid.
+        deviations: errors [m] of each point along its normal, one column for each independent cause.
+        misfit: RMS distance [m] of the cloud from the ellipsoid.
     """
 
     points: Float[Tensor, "n 3"]
@@ -46,9 +46,9 @@ class Ellipsoid:
 def find_ellipsoid(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], outline: Outlines, table: float | None
 ) -> Ellipsoid | None:
-    """Return the ellipsoid, nearly a ball, that fits the whole cloud; None: it is no ball.
+    """Return the ellipsoid, nearly a ball, that fits the whole cloud; None: no such ellipsoid fits.
 
-    The body may be flat where it stands: its ellipsoid may reach below the table, not hang above it.
+    The body may have a flat foot: the ellipsoid may reach below the table, but not float above it.
     """
     rows = farthest_points(points, 300, tie=TIE)
     fit = _Fit(points[rows].numpy(), normals[rows].numpy(), outline, table)
@@ -72,7 +72,7 @@ def find_ellipsoid(
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """The least squares problem of centre [m] and logarithm of the root matrix (6 entries)."""
+    """The least-squares fit of an ellipsoid, by its centre [m] and the logarithm of its root matrix (6 entries)."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -95,13 +95,13 @@ class _Fit:
         return found.x, np.linalg.inv(found.jac.T @ found.jac)
 
     def jacobian(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the derivative of the residuals by differences, all at once: one by one takes four times as long."""
+        """Return the derivatives of the residuals by finite differences, all parameters in one evaluation."""
         step = FORWARD * np.maximum(1.0, np.abs(parameters))
         found = self.residuals(np.concatenate([parameters[None], parameters + np.diag(step)]))
         return ((found[1:] - found[0]) / step[:, None]).T
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Return what is left of points, normals, outline, table and of the prior, over its deviation; (k, 9) rows."""
+        """Return the residuals of points, normals, outline, table and prior over their deviations, for k ellipsoids."""
         distance, normal = self.distance_and_normal(parameters)
         share, k = np.sqrt(len(self.points) / INDEPENDENT), len(parameters)
         shape = _symmetric(parameters[:, 3:])
@@ -121,7 +121,7 @@ class _Fit:
         return np.concatenate(parts, 1)
 
     def distance_and_normal(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distance [m] of the points from ellipsoids, to first order, and their normals there."""
+        """Return the first-order distance [m] of the points from k ellipsoids, and the ellipsoids' normals there."""
         inverse = _exponential(-parameters[:, 3:])
         local = (self.points - parameters[:, None, :3]) @ inverse
         length = _length(local)
@@ -136,19 +136,19 @@ def _length(vectors: np.ndarray) -> np.ndarray:
 
 
 def _support(parameters: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return how far [m] ellipsoids (k, 9) reach along unit vectors."""
+    """Return how far [m] k ellipsoids extend along unit vectors."""
     reach = across @ _exponential(parameters[:, 3:])
     return parameters[:, :3] @ across.T + _length(reach)[..., 0]
 
 
 def _symmetric(entries: np.ndarray) -> np.ndarray:
-    """Return the symmetric matrices with these upper entries."""
+    """Return the symmetric matrices with the given upper entries (k, 6)."""
     matrix = np.zeros((len(entries), 3, 3))
     matrix[:, UPPER[0], UPPER[1]] = matrix[:, UPPER[1], UPPER[0]] = entries
     return matrix
 
 
 def _exponential(entries: np.ndarray) -> np.ndarray:
-    """Return the exponentials of symmetric matrices."""
+    """Return the matrix exponentials of symmetric matrices with the given upper entries (k, 6)."""
     values, vectors = np.linalg.eigh(_symmetric(entries))
     return vectors * np.exp(values)[:, None] @ vectors.swapaxes(1, 2)

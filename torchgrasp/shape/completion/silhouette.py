@@ -1,4 +1,4 @@
-"""Silhouettes: the object stays within its outline and behind its visible surface."""
+"""Silhouettes: the object lies within its outline and behind its visible surface."""
 
 import dataclasses
 
@@ -24,17 +24,17 @@ TIE = 2e-9
 
 @dataclasses.dataclass(frozen=True)
 class Silhouette(Value):
-    """Outline and visible depth of a view, on a raster at depth 1.
+    """The outline and visible depth of one view, as images at depth 1.
 
     Args:
         axes: right, down and forward axis of the camera, as rows.
-        corner, cell: first node of the raster and distance of its nodes, at depth 1.
+        corner, cell: first node of the raster and spacing of the nodes, at depth 1.
         outside: signed distance to the outline at depth 1, positive outside.
         depth: depth [m] of the nearest visible pixel.
         rim: points of the outline [m] at the visible depth.
-        rim_normals: normals there of the cone that the camera and the outline span.
+        rim_normals: surface normals at the rim points, perpendicular to the camera rays.
         cut: whether the object reaches the border of the image. Points beyond the border do not count as outside.
-        gap: greatest width [m] of a part of the outline without measurements, perhaps a hole; 0: none.
+        gap: greatest width [m] of an area within the outline without measurements, perhaps a hole; 0: none.
     """
 
     viewpoint: Float[Tensor, "3"]
@@ -50,26 +50,26 @@ class Silhouette(Value):
 
     @checked(gradients=True)
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] to the visual hull, positive outside."""
+        """Return the signed distance [m] of points to the visual hull, positive outside."""
         outside, _, depth = self._look_up(points)
         return outside * depth
 
     @checked(gradients=True)
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the distance [m] by which points violate the view; 0 where hidden."""
+        """Return how far [m] points are outside the outline or in front of the visible surface; 0 if hidden."""
         outside, visible, depth = self._look_up(points)
         in_front = (visible - depth - FRONT_MARGIN).clamp_min(0)
         return torch.where(outside > 0, outside * depth, in_front)
 
     @checked
     def moved(self, b_from_a: Pose) -> "Silhouette":
-        """Return the silhouette in frame b; it is given in frame a."""
+        """Return the silhouette transformed from frame a to frame b."""
         viewpoint, rim = apply(b_from_a, self.viewpoint[None])[0], apply(b_from_a, self.rim)
         axes, rim_normals = rotate(b_from_a, self.axes), rotate(b_from_a, self.rim_normals)
         return dataclasses.replace(self, viewpoint=viewpoint, axes=axes, rim=rim, rim_normals=rim_normals)
 
     def _look_up(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the outline's distance, the visible depth and the own depth of points."""
+        """Return the distance to the outline, the visible depth and the own depth at each point."""
         local = (points - self.viewpoint) @ self.axes.T
         depth = local[..., 2].clamp_min(1e-9)  # behind the camera is far outside
         position = (local[..., :2] / depth[..., None] - self.corner) / self.cell
@@ -82,18 +82,18 @@ class Silhouette(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Outlines(Value):
-    """The silhouettes of all views of one object; each view's bounds hold."""
+    """The silhouettes of all views of one object; the object satisfies the bounds of every view."""
 
     views: tuple[Silhouette, ...]
 
     @property
     def rim(self) -> Float[Tensor, "k 3"]:
-        """Points of all outlines [m]."""
+        """Points on the outlines of all views [m]."""
         return torch.cat([view.rim for view in self.views])
 
     @property
     def rim_normals(self) -> Float[Tensor, "k 3"]:
-        """Normals there."""
+        """Surface normals at the points of `rim`."""
         return torch.cat([view.rim_normals for view in self.views])
 
     @property
@@ -103,22 +103,22 @@ class Outlines(Value):
 
     @property
     def gap(self) -> float:
-        """Greatest width [m] within an outline where the view measured nothing."""
+        """Greatest width [m] of an area without measurements within an outline."""
         return max(view.gap for view in self.views)
 
     @checked
     def moved(self, b_from_a: Pose) -> "Outlines":
-        """Return the outlines in frame b; they are given in frame a."""
+        """Return the outlines transformed from frame a to frame b."""
         return Outlines(tuple(view.moved(b_from_a) for view in self.views))
 
     @checked(gradients=True)
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] to the visual hull of all views."""
+        """Return the signed distance [m] of points to the visual hull of all views, positive outside."""
         return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
 
     @checked(gradients=True)
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the greatest violation [m] of a view."""
+        """Return the greatest violation [m] of any view by each point."""
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
 
@@ -127,8 +127,8 @@ def silhouettes(cloud: PointCloud) -> Outlines:
     """Return the silhouette of every view of a cloud with viewpoints.
 
     Raises:
-        BadArgument: a cloud without viewpoint, part of a view is beside or behind its camera, or a view shows both
-            sides of the object.
+        BadArgument: a cloud without viewpoint, points beside or behind their camera, or a view that shows both sides of
+            the object.
     """
     views = cloud.split_views()
     for view in views:
@@ -139,9 +139,9 @@ def silhouettes(cloud: PointCloud) -> Outlines:
 
 
 def silhouette(view: PointCloud) -> Silhouette:
-    """Return the silhouette of one view, all in front of its camera.
+    """Return the silhouette of one view; all points lie in front of the camera.
 
-    A gap within the outline is no free space: a mirror-like patch is not measured either.
+    A gap within the outline does not count as free space, because a mirror-like patch is not measured either.
     """
     from scipy.ndimage import binary_fill_holes, distance_transform_edt
     from scipy.spatial import KDTree
@@ -190,7 +190,7 @@ def silhouette(view: PointCloud) -> Silhouette:
 def _beyond_image(
     frustum: Tensor | None, axes: np.ndarray, corner: np.ndarray, cell: float, mask: np.ndarray, margin: float
 ) -> np.ndarray:
-    """Return which cells are beyond a side of the image that the mask reaches, or within `margin` of it."""
+    """Return which cells lie beyond an image border that the mask reaches, or within `margin` of this border."""
     beyond = np.zeros(mask.shape, dtype=bool)
     if frustum is None:
         return beyond
@@ -204,7 +204,7 @@ def _beyond_image(
 
 
 def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> None:
-    """Refuse points that no camera at the viewpoint sees at once."""
+    """Raise `BadArgument` for points that no camera at the viewpoint can see at once."""
     from scipy.spatial import KDTree
 
     forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
@@ -226,7 +226,7 @@ def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> 
 def _project(
     points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Return the axes of a camera that faces the points, and their pixels and depths [m]."""
+    """Return the axes of a camera that faces the points, and the points' pixels and depths [m]."""
     points, viewpoint = points.double().cpu(), viewpoint.double().cpu()
     axes = _camera_axes((points.amax(0) + points.amin(0)) / 2 - viewpoint)
     local = (points - viewpoint) @ axes.T
@@ -234,7 +234,7 @@ def _project(
 
 
 def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Return right, down and forward axis of a camera, as rows."""
+    """Return the right, down and forward axes of a camera with a given viewing direction, as rows."""
     forward = unit(forward)
     helper = torch.zeros_like(forward)
     helper[forward.abs().argmin()] = 1.0
@@ -252,7 +252,7 @@ def _distance(mask: np.ndarray) -> np.ndarray:
 def _rim(
     outside: np.ndarray, seen: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their normals."""
+    """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their surface normals."""
     from scipy.ndimage import gaussian_filter
     from scipy.spatial import KDTree
 

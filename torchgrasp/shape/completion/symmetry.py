@@ -1,4 +1,4 @@
-"""Mirror planes of a partial cloud: the image falls onto the cloud, not into free space."""
+"""Mirror planes of a partial cloud: the mirror image must lie on the cloud or be hidden, not in free space."""
 
 import dataclasses
 import math
@@ -32,7 +32,7 @@ AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.4
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryScorer:
-    """Scores mirror planes: mirrored `probes` against the cloud, its outlines and the table.
+    """Scores mirror planes: compares mirrored `probes` with the cloud, its outlines and the table.
 
     `upright` means that all planes are parallel to z: the vertical, or the axis of a body of revolution.
     """
@@ -48,7 +48,7 @@ class SymmetryScorer:
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
-        """Return the scorer of a cloud with normals; all points are probes. `table` is the height [m] of the table."""
+        """Return the scorer of a cloud with normals, with probes from all points. `table` is the table's height [m]."""
         from scipy.spatial import KDTree
 
         assert cloud.normals is not None
@@ -58,7 +58,7 @@ class SymmetryScorer:
         return whole.for_part(torch.arange(len(cloud)))
 
     def about_axis(self, axis_from_cloud: Float[Tensor, "4 4"]) -> "SymmetryScorer":
-        """Return the scorer in the frame of an axis, which is its z."""
+        """Return the scorer in another frame, whose z axis is an axis of revolution."""
         from scipy.spatial import KDTree
 
         points, normals = apply(axis_from_cloud, self.points), rotate(axis_from_cloud, self.normals)
@@ -68,31 +68,31 @@ class SymmetryScorer:
         return SymmetryScorer(points, normals, tree, outline, table, True, probes, probe_normals)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
-        """Return the scorer with probes from some points of the cloud."""
+        """Return the scorer with probe points from the given points of the cloud only."""
         rows = rows[farthest_points(self.points[rows], PROBES, tie=TIE)]
         return dataclasses.replace(self, probes=self.points[rows], probe_normals=self.normals[rows])
 
     @property
     def center(self) -> Tensor:
-        """Centre of the cloud's box [m]."""
+        """Centre of the cloud's bounding box [m]."""
         return (self.points.amax(0) + self.points.amin(0)) / 2
 
     @property
     def size(self) -> float:
-        """Longest side of the cloud's box [m]."""
+        """Longest side of the cloud's bounding box [m]."""
         return float((self.points.amax(0) - self.points.amin(0)).max())
 
     def nearest(self, points: Tensor, limit: float = math.inf) -> tuple[Tensor, Tensor]:
-        """Return the nearest point's distance [m] and index; infinity and 0 beyond the limit."""
+        """Return distance [m] and index of the nearest cloud point; infinity and 0 beyond the limit."""
         distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)  # pyright: ignore
         shape = points.shape[:-1]
         index = torch.from_numpy(np.where(np.isinf(distance), 0, index)).reshape(shape)
         return torch.from_numpy(distance).reshape(shape), index
 
     def score(self, planes: Float[Tensor, "p 4"]) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """Return scores of planes n.x = o, as (n, o), and violations of free space.
+        """Return the scores of planes n.x = o, given as (n, o), and their violations of free space in [0, 1].
 
-        A violation is in [0, 1]. The score is the match with the cloud minus twice the violation.
+        The score is the match of the mirror image with the cloud, minus twice the violation.
         """
         mirrored = reflect(self.probes, planes[:, None])
         normals = reflect_directions(self.probe_normals, planes[:, None])
@@ -109,9 +109,10 @@ class SymmetryScorer:
 def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"]]:
     """Return the mirror planes of a cloud, best first, and their scores.
 
-    Planes come from a grid, vertical ones on a table. The best are refined. On a table one at right angles to the best
-    of all is added where none is near it: its own score is not informative, since its images are hidden. A level plane
-    halfway up shows the underside. A body of revolution (`turned`) needs neither: all planes through its axis match.
+    Planes from a grid are scored and the best are refined; on a table only vertical planes are tried. On a table a
+    plane perpendicular to the best is added if no plane is near it: its own score says little, because its images are
+    hidden. A horizontal plane halfway up gives the underside. A body of revolution (`turned`) needs neither, because
+    all planes through its axis match.
     """
     view = torch.stack([unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]).mean(0)
     if not scorer.upright:
@@ -150,9 +151,9 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Float[Ten
 def find_plane_through_axis(
     scorer: SymmetryScorer, center: Float[Tensor, "2"], part: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
-    """Return the mirror plane of a part through the vertical axis at `center`, with its score.
+    """Return the mirror plane through the vertical axis at `center` of an attached part, and its score.
 
-    Prefers the plane with least extent normal to it, even if the other half is occluded.
+    The plane with the least extent of the part across it is preferred, even if half of the part is hidden.
     """
     normals = _level_directions(96)
     planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
@@ -166,7 +167,7 @@ def find_plane_through_axis(
 def planes_near(
     scorer: SymmetryScorer, plane: Float[Tensor, "4"], angles: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
 ) -> Float[Tensor, "p 4"]:
-    """Return planes near a plane: turned by angles [rad] and shifted [m]; on a table about the vertical alone."""
+    """Return planes near a plane: rotated by `angles` [rad] and shifted [m]; if `upright`, rotated about z only."""
     normal = plane[:3]
     if scorer.upright:
         sideways = torch.stack([-normal[1], normal[0], torch.zeros_like(normal[0])])[None]
@@ -180,7 +181,7 @@ def planes_near(
 
 
 def _level_directions(n: int) -> Float[Tensor, "n 3"]:
-    """Return n horizontal unit vectors over half a turn."""
+    """Return n horizontal unit vectors over half a circle."""
     angle = torch.arange(n, dtype=torch.float64) * math.pi / n
     return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
 
@@ -188,7 +189,7 @@ def _level_directions(n: int) -> Float[Tensor, "n 3"]:
 def _plane_grid(
     scorer: SymmetryScorer, directions: Float[Tensor, "d 3"], count: int = OFFSETS
 ) -> Float[Tensor, "d k 4"]:
-    """Return planes with these normals at offsets over the cloud's extent."""
+    """Return planes with the given normals, at offsets over the cloud's extent."""
     along = scorer.points @ directions.T
     low, high = along.amin(0), along.amax(0)
     middle, half = (low + high) / 2, ((high - low) / 2).clamp_min(0.15 * scorer.size)
@@ -199,7 +200,7 @@ def _plane_grid(
 def _pick_planes(
     scores: Float[Tensor, "d k"], directions: Float[Tensor, "d 3"], across: Float[Tensor, "3"] | None
 ) -> list[tuple[int, int]]:
-    """Return the best planes that lie across the view and apart: rows of the grid."""
+    """Return the grid indices of the best planes that hide points from the view and differ enough in direction."""
     best, offset = scores.max(1)
     hides = _hides(directions, across)
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if hides[i]]
@@ -213,14 +214,14 @@ def _pick_planes(
 
 
 def _hides(directions: Float[Tensor, "d 3"], across: Float[Tensor, "3"] | None) -> Bool[Tensor, "d"]:
-    """Return which planes with these normals hide points from a view; without a single view, all."""
+    """Return which planes, given by their normals, can have hidden mirror images; all, if `across` is None."""
     return torch.ones(len(directions), dtype=torch.bool) if across is None else (directions @ across).abs() > MIN_FACING
 
 
 def _without_slope(
     scorer: SymmetryScorer, planes: list[Float[Tensor, "4"]], best: Float[Tensor, "4"]
 ) -> list[Float[Tensor, "4"]]:
-    """Drop near-duplicates of the best plane, which itself may hide no points."""
+    """Remove planes that score well only because they are near the best plane."""
     least = float(scorer.score(best[None])[0]) - SLOPE
     return [p for p in planes if abs(float(p[:3] @ best[:3])) < APART or float(scorer.score(p[None])[0]) > least]
 
@@ -231,7 +232,7 @@ def _across_plane(
     grid: Float[Tensor, "d k 4"],
     across: Float[Tensor, "3"] | None,
 ) -> Float[Tensor, "p 4"]:
-    """Return the best plane across the view if no plane is; none if all violate free space."""
+    """Return the best plane that faces the view, unless there is one; none if all violate free space."""
     if across is None or any(abs(float(plane[:3] @ across)) > FACING for plane in planes):
         return grid.new_zeros(0, 4)
     found = _best_plane(scorer, grid[(grid[:, 0, :3] @ across).abs() > FACING].reshape(-1, 4), -math.inf)
@@ -244,7 +245,7 @@ def _square_plane(
     best: Float[Tensor, "4"],
     across: Float[Tensor, "3"] | None,
 ) -> Float[Tensor, "p 4"]:
-    """Return the best vertical plane at right angles to another, if it hides points and no plane is near it."""
+    """Return the best vertical plane perpendicular to another, if it can add hidden points and no plane is near it."""
     direction = torch.stack([-best[1], best[0], torch.zeros_like(best[0])])[None]
     near = any(abs(float(plane[:3] @ direction[0])) > 0.42 for plane in planes)
     if near or not bool(_hides(direction, across)):
@@ -253,13 +254,13 @@ def _square_plane(
 
 
 def _level_plane(scorer: SymmetryScorer, table: Plane) -> Float[Tensor, "p 4"]:
-    """Return the level plane halfway up an object on a table; none if it matches nothing."""
+    """Return the horizontal plane halfway up an object on a table; none if its mirror image does not match."""
     half = (scorer.points[:, 2].max() + table.offset) / 2
     return _best_plane(scorer, torch.stack([0 * half, 0 * half, 0 * half + 1, half])[None], 0.0)
 
 
 def _best_plane(scorer: SymmetryScorer, planes: Float[Tensor, "k 4"], least: float) -> Float[Tensor, "p 4"]:
-    """Return the plane with the best score above the least one, among those that free space allows; or none."""
+    """Return the plane of the greatest score above `least` that does not violate free space; or none."""
     if not len(planes):
         return planes
     scores, violation = scorer.score(planes)

@@ -1,4 +1,4 @@
-"""Open vessels: an outer and an inner wall about one vertical axis, the inner one seen through the mouth."""
+"""Open vessels: an outer and an inner wall about a vertical axis; the camera sees the inner wall through the mouth."""
 
 import dataclasses
 import math
@@ -29,12 +29,12 @@ class Vessel(Value):
     """An open vessel with a vertical axis; lengths in metres.
 
     Args:
-        center: of the axis.
-        thickness: of the wall: the fitted one, weighted with the usual one.
+        center: position of the axis.
+        thickness: thickness of the wall, the mean of the fitted and the usual thickness, weighted by certainty.
         radius: outer radius of the mouth.
         rim: height of the mouth.
-        inner: points seen through the mouth.
-        body: points on either wall, without ears, handles, rim and floor.
+        inner: mask of the points seen through the mouth.
+        body: mask of the points on either wall, without handles, rim and floor.
     """
 
     center: Float[Tensor, "2"]
@@ -46,10 +46,10 @@ class Vessel(Value):
 
 
 def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Vessel | None:
-    """Return the open vessel that the cloud shows; None: there is none.
+    """Return the open vessel that a cloud shows; None: the cloud shows no vessel.
 
-    Normals of an inner wall point to the axis. Both walls are fitted at once: the radius is a cubic in the height,
-    less thickness / slope of the normal inside. Reweighted least squares (Cauchy) ignore ears and handles.
+    Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a cubic polynomial of
+    the height, and the inner radius is less by thickness / slope of the normal. Robust weights (Cauchy) ignore handles.
     """
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     level = normals[:, :2] / slope[:, None].clamp_min(1e-9)
@@ -96,9 +96,9 @@ def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> 
 
 @dataclasses.dataclass(frozen=True)
 class HiddenWall(Batch):
-    """Points of a wall that the camera did not see [m], with outward normals.
+    """Estimated points of a wall that the camera did not see [m], with outward normals.
 
-    `shared` holds errors [m] for one standard deviation of axis (two), thickness and floor.
+    The columns of `shared` are errors [m] for one standard deviation of axis position (two), thickness and floor.
     """
 
     points: Float[Tensor, "m 3"]
@@ -108,16 +108,17 @@ class HiddenWall(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class Wall(Value):
-    """One wall of a vessel: `seen` selects its points of the cloud, `hidden` holds estimated points."""
+    """One wall of a vessel: `seen` is the mask of its cloud points, `hidden` holds estimated points."""
 
     seen: Bool[Tensor, "n"]
     hidden: HiddenWall
 
 
 def complete_walls(cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float) -> tuple[Wall, Wall]:
-    """Return the outer and the inner wall of a vessel that stands on a table of this height [m].
+    """Return the outer and the inner wall of a vessel on a table of height `table` [m].
 
-    The other side of a seen wall is a thickness away. Parts seen on neither side come from rotation about the axis.
+    The other side of a seen wall is one thickness away. Parts that were seen on neither side come from rotation about
+    the axis.
     """
     points, normals = cloud.points, cloud.normals
     assert normals is not None
@@ -142,14 +143,14 @@ def lid(vessel: Vessel) -> HiddenWall:
 
 
 def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
-    """Return the other side of a wall."""
+    """Return the opposite side of a wall, one thickness away."""
     shared = wall.shared.clone()
     shared[:, 2] += THICKNESS_ERROR
     return HiddenWall(wall.points - vessel.thickness * wall.normals, -wall.normals, shared)
 
 
 def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
-    """Return 80 points of a wall rotated about the axis by 23 angles, with the errors of the axis."""
+    """Return 80 points of a wall, rotated about the axis by 23 angles, with the errors of the axis position."""
     wall = wall[farthest_points(wall.points, 80, tie=TIE)]
     turn = rotations_about_z(24)
     axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64)])
@@ -162,7 +163,7 @@ def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
 
 
 def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
-    """Return the rotations by k / n of a full turn about z, with k from 1 to n - 1."""
+    """Return the rotations about z by k / n of a full circle, for k from 1 to n - 1."""
     angle = torch.arange(1, n, dtype=torch.float64) * (2 * math.pi / n)
     turn = torch.zeros(n - 1, 3, 3, dtype=torch.float64)
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
@@ -171,7 +172,7 @@ def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
 
 
 def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float, int], ...]) -> HiddenWall:
-    """Return level points with normals up, on rings about the axis given by relative radius and number of points."""
+    """Return horizontal points with normals up on rings about the axis; `rings`: relative radius, number of points."""
     places = []
     for share, count in rings:
         angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
@@ -187,7 +188,7 @@ def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float
 def _merge(
     seen: Float[Tensor, "n 3"], outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float
 ) -> HiddenWall:
-    """Return points of the parts, the first parts first, that are new, hidden, below the rim and above `least`."""
+    """Return points of the parts, first parts first, that are new, hidden, below the rim and above height `least`."""
     from scipy.spatial import KDTree
 
     tree, merged = KDTree(seen.numpy()), parts[0][:0]
