@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
-from torchgrasp.data import list_views, read_family, read_group, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import PROTOCOLS, close_hand
@@ -73,7 +73,8 @@ def subjects(spec: TableSpec) -> list[Subject]:
     found = [Subject(None, name, f"own {name}", "") for name in list_objects() if spec.own]
     for folder in spec.objects:
         names = dict.fromkeys(name for name, _ in list_views(folder))
-        found += [Subject(folder, name, read_family(folder, name), read_group(folder, name)) for name in names]
+        entries = {name: read_entry(folder, name) for name in names}
+        found += [Subject(folder, name, entry.family, entry.group) for name, entry in entries.items()]
     families: dict[str, list[Subject]] = {}
     for subject in sorted((s for s in found if not spec.only or s.name in spec.only), key=lambda s: s.label):
         families.setdefault(subject.family, []).append(subject)

@@ -13,7 +13,7 @@ import torch
 import tyro
 from benchmarks.ground_truth import read_views, sample_mesh
 
-from torchgrasp.data import read_family
+from torchgrasp.data import read_entry
 from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.files import format_columns
 from torchgrasp.shape.fit import fit_shape
@@ -108,5 +108,7 @@ def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
             estimate = shape.predict(hidden[inside])
             ratio = np.full(len(hidden), np.inf)
             ratio[inside.numpy()] = (estimate.distance.abs() / estimate.variance.sqrt()).numpy()
-            rows.append({"family": read_family(objects, name), "ratio": ratio, "kind": (shape.kind, table is not None)})
+            rows.append(
+                {"family": read_entry(objects, name).family, "ratio": ratio, "kind": (shape.kind, table is not None)}
+            )
     return rows

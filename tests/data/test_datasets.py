@@ -10,7 +10,7 @@ import trimesh
 
 from torchgrasp import PointCloud
 from torchgrasp.cloud.read import save_cloud
-from torchgrasp.data import list_views, read_family, read_group, read_object_mesh, read_view, write_objects
+from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view, write_objects
 from torchgrasp.errors import BadArgument, MeshError
 
 
@@ -45,8 +45,8 @@ def test_views_are_listed_in_order(folder: Path):
 
 
 def test_an_object_without_family_is_one_of_its_own(folder: Path):
-    assert (read_family(folder, "box"), read_group(folder, "box")) == ("cuboid", "solid")
-    assert (read_family(folder, "torn"), read_group(folder, "torn")) == ("torn", "")
+    found = [(entry.family, entry.group) for entry in (read_entry(folder, name) for name in ("box", "torn"))]
+    assert found == [("cuboid", "solid"), ("torn", "")]
 
 
 def test_views_and_meshes_come_at_the_suggested_scale(folder: Path):

@@ -14,7 +14,7 @@ import trimesh
 
 from torchgrasp import PointCloud
 from torchgrasp.cloud.read import save_cloud
-from torchgrasp.data import list_entries, list_views, read_entry, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_entries, read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, CloudFileError, DatasetError, MeshError, Status
 from torchgrasp.evaluation import EvaluationSpec, Protocol, evaluate
 from torchgrasp.hand.load import load_hand
@@ -97,7 +97,7 @@ def put(folder: Path, size: float = 0.06, view: str = "v0") -> None:
 @pytest.mark.parametrize("name", ENTRIES)
 def test_a_bad_entry_is_refused_by_field_and_the_others_are_read(tmp_path: Path, name: str):
     write(tmp_path, {"bad": ENTRIES[name], "good": GOOD})
-    assert list_entries(tmp_path) == ["bad", "good"] and list_views(tmp_path, only=["good"]) == [("good", "v0")]
+    assert list(read_entries(tmp_path)) == ["bad", "good"] and list_views(tmp_path, only=["good"]) == [("good", "v0")]
     with pytest.raises(DatasetError, match=r"manifest\.json: objects\.bad") as refused:
         read_entry(tmp_path, "bad")
     assert len(str(refused.value)) < 500
@@ -138,7 +138,7 @@ def test_pipes_and_links_to_the_outside_are_refused(tmp_path: Path):
     (folder / "manifest.json").unlink()
     os.mkfifo(folder / "manifest.json")
     with pytest.raises(DatasetError, match="no file"):
-        list_entries(folder)
+        read_entries(folder)
 
 
 def test_a_view_that_is_not_there_is_named(tmp_path: Path):
@@ -180,4 +180,4 @@ def test_two_names_never_share_a_file_of_grasps(tmp_path: Path):
 
 def test_unknown_objects_are_refused(tmp_path: Path):
     with pytest.raises(BadArgument, match="asked for"):
-        list_entries(write(tmp_path, {"cup": GOOD}), only=["jug"])
+        read_entries(write(tmp_path, {"cup": GOOD}), only=["jug"])

@@ -1,9 +1,8 @@
 """Objects that are shipped, folders of objects and views, and shards of grasps."""
 
 from torchgrasp.data.shipped import GraspObject, list_objects, load_object, load_scene, load_shipped_grasp
-from torchgrasp.data.manifest import ObjectEntry as ObjectEntry, list_entries as list_entries, list_views
-from torchgrasp.data.manifest import read_entry as read_entry, read_family as read_family, read_group as read_group
-from torchgrasp.data.manifest import read_mass as read_mass, read_object_mesh, read_view, write_objects
+from torchgrasp.data.manifest import ObjectEntry as ObjectEntry, read_entries as read_entries, read_entry as read_entry
+from torchgrasp.data.manifest import list_views, read_object_mesh, read_view, write_objects
 from torchgrasp.data.shards import JobRow
 from torchgrasp.data.reader import GraspShards, ShardJob, read_shards
 

@@ -1,12 +1,10 @@
 """Folders of objects: true meshes and views of them.
 
 `manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera" (4x4). Its folder
-has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply the object's "suggested_scale"
-(default 1), at which a hand can grasp it. Optional are "mass_kg", the "family" of look-alikes that it belongs to, and
-its "group", such as "solid".
+has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. Readers apply the object's "suggested_scale" (default 1).
+"mass_kg", "family" and "group" are optional.
 
-The folder of a stranger may hold anything. A name of an object or a view is one part of a path, and no file outside
-the folder is read.
+A folder from a stranger may hold anything: a name is one part of a path, and no file outside the folder is read.
 """
 
 import dataclasses
@@ -35,14 +33,14 @@ MESHES = (".ply", ".stl", ".obj", ".off")  # suffixes of the meshes that `write_
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEntry:
-    """What the manifest says of an object.
+    """The manifest's entry of an object.
 
     Args:
-        views: the camera's position [m] of each view, by name, at scale 1.
+        views: position [m] of the camera of each view by name, at scale 1.
         scale: factor of mesh and clouds.
-        family: look-alikes that it belongs to; its own name if the manifest has none.
-        group: such as "solid", "thin" or "shell"; "" if the manifest has none.
-        mass: of the real object [kg], whatever its scale; None: the manifest has none.
+        family: family of similar objects; the object's own name by default.
+        group: group of objects such as "solid", "thin" or "shell"; "" by default.
+        mass: mass [kg] of the real object at any scale, or None.
     """
 
     views: dict[str, tuple[float, ...]]
@@ -52,33 +50,28 @@ class ObjectEntry:
     mass: float | None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
-        """Return the sorted names of the views, at most so many; with `whole` only `WHOLE`."""
+        """Return the sorted names of at most `most` views; with `whole` only `WHOLE`."""
         return ([WHOLE] if whole else sorted(self.views))[:most]
 
 
 @checked
-def list_entries(objects: Path | str, only: Sequence[str] = ()) -> list[str]:
-    """Return the names of the objects of a folder, sorted; `only` selects some. Their entries may be bad.
-
-    Raises:
-        DatasetError: no manifest, or none of the objects in it.
-    """
-    return sorted(_read_fields(objects, only))
-
-
-@checked
 def read_entry(objects: Path | str, name: str) -> ObjectEntry:
-    """Return what the manifest says of an object.
+    """Return the entry of an object.
 
     Raises:
-        DatasetError: no such object, a field that is missing or of a wrong type or range, or a name that is no name of
-            a folder.
+        DatasetError: no such object, a missing field, a field of a wrong type or range, or a name that is no name of a
+            folder.
     """
     return _parse_entry(name, _read_fields(objects, [name])[name])
 
 
+@checked
 def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, ObjectEntry | DatasetError]:
-    """Return what the manifest says of each object, sorted by name, or what is wrong with its entry."""
+    """Return the entry of each object, or the error in its entry, sorted by name; `only` selects objects.
+
+    Raises:
+        DatasetError: no manifest, or none of the objects in it.
+    """
     found: dict[str, ObjectEntry | DatasetError] = {}
     for name, field in sorted(_read_fields(objects, only).items()):
         try:
@@ -89,13 +82,13 @@ def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, Obj
 
 
 def _parse_entry(name: str, field: Field) -> ObjectEntry:
-    """Return the entry of an object, checked."""
-    check_name(field, name)
+    """Check the entry of an object and return it."""
+    _check_name(field, name)
     fields, views = field.entries(), {}
     if "views" not in fields:
         raise field.wrong('an object with "views"')
     for view, of_view in fields["views"].entries().items():
-        check_name(of_view, view)
+        _check_name(of_view, view)
         pose = of_view.entries().get("T_object_camera")
         if pose is None:
             raise of_view.wrong('an object with "T_object_camera"')
@@ -115,31 +108,31 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
 
 @checked
 def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0) -> list[str]:
-    """Make a folder of objects from a folder of bare meshes; return the objects' names, those of the files.
+    """Make a folder of objects from a folder of meshes; return the objects' names, which are those of the files.
 
-    Each mesh is set down: its lowest point at z = 0, the middle of its box above the origin. Each view is that of the
-    depth camera of `partial_view` from a random side. The manifest is written last, so that a folder that has one is
-    whole.
+    Each mesh is moved: its lowest point to z = 0, the middle of its box above the origin. The depth camera of
+    `partial_view` sees it from random sides. The manifest is written last, so a folder with a manifest is complete.
 
     Args:
-        meshes: folder of closed meshes in metres, z up (.ply, .stl, .obj, .off).
+        meshes: folder of closed meshes [m], z up (.ply, .stl, .obj, .off).
         out: folder to write.
-        views: of each object.
-        seed: of the cameras and of their noise.
+        views: number of views of each object.
+        seed: seed of the cameras and of their noise.
 
     Raises:
-        DatasetError: no meshes, or two of one name.
+        DatasetError: no meshes, or two meshes of one name.
         MeshError, SuspiciousScale: as `read_mesh`.
         OutputError: the folder cannot be written.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
     >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
-    >>> write_objects(folder, folder / "objects", views=1)
-    ['carton']
+    >>> write_objects(folder, folder / "objects", views=1), list_views(folder / "objects")
+    (['carton'], [('carton', 'view0')])
+    >>> len(read_view(folder / "objects", "carton", "view0"))
+    1000
     """
-    # Of a rendered view: angle above the horizontal [deg], uniform, and distance [m], as of a camera on a robot's arm
-    elevations, distance = (25.0, 45.0), 0.5
+    lowest, highest, distance = 25.0, 45.0, 0.5  # angles of the camera above the horizontal [deg], its distance [m]
     files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in MESHES)
     names = [path.stem for path in files]
     if not files or len(set(names)) != len(names):
@@ -150,13 +143,11 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
         mesh = read_mesh(path)
         low, high = mesh.bounds
         mesh = mesh.copy().apply_translation([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
-        content = mesh.export(file_type="ply")
-        write_file(Path(out) / path.stem / "mesh.ply", content)
+        write_file(Path(out) / path.stem / "mesh.ply", mesh.export(file_type="ply"))
         poses = dict[str, object]()
         for k in range(views):
             first, second = torch.rand(2, generator=generator).tolist()
-            elevation = elevations[0] + (elevations[1] - elevations[0]) * second
-            camera = look_at(360.0 * first, elevation, distance, mesh)
+            camera = look_at(360.0 * first, lowest + (highest - lowest) * second, distance, mesh)
             noise = int(torch.randint(2**31, (1,), generator=generator))
             save_cloud(partial_view(mesh, camera, seed=noise), Path(out) / path.stem / f"view{k}_noisy.ply")
             poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
@@ -165,8 +156,8 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
     return names
 
 
-def check_name(field: Field, name: str) -> None:
-    """Refuse a name that is more than one part of a path, or that a terminal would not print."""
+def _check_name(field: Field, name: str) -> None:
+    """Refuse a name that is more than one part of a path or not printable."""
     longest_name = 100  # most letters of a name: file names have 255 bytes
     plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
     if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= longest_name:
@@ -178,19 +169,12 @@ def check_name(field: Field, name: str) -> None:
 def list_views(
     objects: Path | str, whole: bool = False, only: Sequence[str] = (), most: Count | None = None
 ) -> list[tuple[str, str]]:
-    """Return sorted pairs of object and view, at most so many of an object; None: all.
+    """Return sorted pairs of object and view, at most `most` views of an object.
 
-    `only` selects objects; with `whole` each has one view, `WHOLE`.
+    `only` selects objects; with `whole` each object has the view `WHOLE` alone.
 
     Raises:
         DatasetError: no manifest, none of the objects in it, or a bad entry.
-
-    >>> import tempfile, trimesh
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
-    >>> _ = write_objects(folder, folder / "objects", views=1)
-    >>> list_views(folder / "objects")
-    [('carton', 'view0')]
     """
     entries = {name: _parse_entry(name, field) for name, field in sorted(_read_fields(objects, only).items())}
     return [(name, view) for name, x in entries.items() for view in x.list_views(whole, most)]
@@ -203,13 +187,6 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
     Raises:
         DatasetError: as `read_entry`, or no such view.
         CloudFileError: a bad file.
-
-    >>> import tempfile, trimesh
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
-    >>> _ = write_objects(folder, folder / "objects", views=1)
-    >>> len(read_view(folder / "objects", "carton", "view0"))
-    1000
     """
     entry = read_entry(objects, name)
     if view == WHOLE:
@@ -224,39 +201,13 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
 
 @checked
 def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
-    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`.
-
-    >>> import tempfile, trimesh
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
-    >>> _ = write_objects(folder, folder / "objects", views=1)
-    >>> round(float(read_object_mesh(folder / "objects", "carton").volume), 6)
-    0.00036
-    """
+    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`."""
     scale = read_entry(objects, name).scale
     return read_mesh(_file(objects, name, "mesh.ply")).apply_scale(scale)
 
 
-@checked
-def read_family(objects: Path | str, name: str) -> str:
-    """Return the family of look-alikes of an object, see `ObjectEntry`."""
-    return read_entry(objects, name).family
-
-
-@checked
-def read_group(objects: Path | str, name: str) -> str:
-    """Return the group of an object, see `ObjectEntry`."""
-    return read_entry(objects, name).group
-
-
-@checked
-def read_mass(objects: Path | str, name: str) -> float | None:
-    """Return the mass [kg] of an object, see `ObjectEntry`."""
-    return read_entry(objects, name).mass
-
-
 def _file(objects: Path | str, name: str, file: str) -> Path:
-    """Return the path of an object's file, which may not be linked to one outside the folder."""
+    """Return the path of an object's file; refuse a link to a file outside the folder."""
     path, folder = Path(objects) / name / file, Path(objects).resolve()
     if not path.resolve().is_relative_to(folder):
         raise DatasetError("objects", f"{path}, which is {path.resolve()}", f"files within {folder}")
@@ -264,15 +215,14 @@ def _file(objects: Path | str, name: str, file: str) -> Path:
 
 
 def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
-    """Return the entries of the objects asked for, all of them if `only` is empty."""
+    """Return the fields of the objects `only`, or of all objects if `only` is empty."""
 
     def refuse(found: str, allowed: str) -> DatasetError:
         return DatasetError("objects", found, allowed)
 
     path = Path(objects) / "manifest.json"
-    top = read_json(
-        path, refuse, "a folder with a manifest.json in UTF-8 (`torchgrasp cloud views` makes one of meshes)"
-    ).entries()
+    allowed = "a folder with a manifest.json in UTF-8 (`torchgrasp cloud views` makes one from meshes)"
+    top = read_json(path, refuse, allowed).entries()
     entries = top["objects"].entries() if "objects" in top else {}
     chosen = {name: entries[name] for name in entries if not only or name in only}
     if not chosen:

@@ -1,4 +1,4 @@
-"""The data set of a campaign, grasp by grasp for learning, or job by job."""
+"""Data sets of grasps, read grasp by grasp for learning, or job by job."""
 
 import bisect
 import dataclasses
@@ -16,17 +16,16 @@ from torch import Tensor
 from torchgrasp.checks import Count, Range, checked
 from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row
 from torchgrasp.errors import ModelFileError
-from torchgrasp.files import Field, Recent, read_json
+from torchgrasp.files import Recent, read_json
 from torchgrasp.values import Grasps, PointCloud
 
-CARD = "card.json"  # file that describes a data set; it is written last, so a folder that has one is whole
-KEPT = 32  # shards that stay in memory: of 64 jobs with 20 grasps each one takes 3 MB, mostly clouds
+CARD = "card.json"  # file that describes a data set; it is written last, so a folder with a card is complete
 
 
 class ShardJob(NamedTuple):
-    """A job of a data set: its row, the cloud (None: no view was read) and the grasps that were tried.
+    """A job of a data set: its row, its cloud (None: no view was read) and the grasps that were tried.
 
-    `passed` and `outcome` (a `Status`) have a row for each grasp, and a column for each try in the simulator.
+    `passed` and `outcome` (a `Status`) have a row for each grasp and a column for each try in the simulator.
     """
 
     row: JobRow
@@ -40,18 +39,17 @@ class ShardJob(NamedTuple):
 class GraspShards:
     """A data set of grasps on disk, from `read_shards`; a map-style dataset for `torch.utils.data.DataLoader`.
 
-    `len` counts the grasps. Item i is a dict of tensors, float32 for learning, metres and radians in the object's
-    frame: `points` (n, 3) and `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach` (3,),
-    `obj_from_hand` (4, 4); `contacts` and `normals` (f, 3), `std_m` (f,); `margin`, `witness` (6,) and `closed` of the
-    certificate; `clearance`; `predicted` and `simulated` success; `job`, the place in `jobs`. `simulated` is the share
-    of tries that passed.
+    `len` counts the grasps. Item i is a dict of float32 tensors [m, rad] in the object's frame: `points` (n, 3) and
+    `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach` (3,), `obj_from_hand` (4, 4); `contacts` and
+    `normals` (f, 3), `std_m` (f,); `margin` and `witness` (6,) of the certificate; `clearance`; `predicted` success;
+    `simulated`, the share of tries that passed. `closed` is a bool, `job` the index in `jobs`.
 
     Args:
-        folder: of the data set.
-        card: what `card.json` says of it.
-        jobs: one row for each object and view, those without a grasp too.
-        size: jobs of a shard.
-        points: of each item's cloud; None: all, and then items of one batch may differ.
+        folder: folder of the data set.
+        card: content of `card.json`.
+        jobs: a row for each object and view, with or without grasps.
+        size: number of jobs in a shard.
+        points: number of points of each item's cloud; None: all points, so clouds may differ in size.
     """
 
     folder: Path
@@ -59,26 +57,29 @@ class GraspShards:
     jobs: tuple[JobRow, ...]
     size: int
     points: int | None = None
-    recent: Recent[Any] = dataclasses.field(default_factory=lambda: Recent[Any](KEPT), repr=False, compare=False)
+    recent: Recent[Any] = dataclasses.field(default_factory=lambda: Recent[Any](32), repr=False, compare=False)
 
     @functools.cached_property
     def starts(self) -> list[int]:
-        """The place of each job's first grasp, and their number at the end."""
+        """Index of each job's first grasp, and the number of grasps at the end."""
         return list(itertools.accumulate((row.grasps for row in self.jobs), initial=0))
 
     def __len__(self) -> int:
-        """Count the grasps."""
         return self.starts[-1]
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        """Iterate over the grasps."""
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, i: int) -> dict[str, Tensor]:
-        """Return grasp i; raises `IndexError` beyond the last, `ModelFileError` if its shard is damaged."""
+        """Return grasp i.
+
+        Raises:
+            IndexError: no such grasp.
+            ModelFileError: its shard is damaged.
+        """
         i = range(len(self))[operator.index(i)]
         j = bisect.bisect_right(self.starts, i) - 1
-        shard, first = self._shard(j // self.size), j - j % self.size
+        shard, first = self.recent.get(j // self.size, self._read), j - j % self.size
         g = i - self.starts[first]
         p = sum(row.points for row in self.jobs[first:j])
         records, grasps = shard.records, shard.records.grasps
@@ -104,25 +105,21 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Read job j whole, in the precision of the file.
+        """Return job j in the precision of the file.
 
         Raises:
             IndexError: no such job.
             ModelFileError: its shard is missing, damaged, or belongs to another campaign.
         """
         j = range(len(self.jobs))[j]
-        row, records = self._shard(j // self.size).take(j % self.size)
+        row, records = self.recent.get(j // self.size, self._read).take(j % self.size)
         grasps = dataclasses.replace(records.grasps, meta=dict(row[0].meta))
         eye = records.viewpoints[0] if bool(records.viewpoints.any()) else None
         cloud = PointCloud(records.points, viewpoint=eye) if len(records.points) else None
         return ShardJob(row[0], cloud, grasps, records.passed, records.outcome)
 
-    def _shard(self, k: int) -> Shard:
-        """Read shard k; the last few stay in memory."""
-        return self.recent.get(k, self._read)
-
     def _read(self, k: int) -> Shard:
-        """Read a shard and compare its rows with the card's."""
+        """Read shard k and compare its rows with the card's."""
         path = shard_path(self.folder, k)
         shard = load_shard(path, {"campaign": str(self.card["campaign"])})
         bare = tuple(row._replace(meta={}) for row in shard.rows)
@@ -141,9 +138,9 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     """Open the data set that a campaign wrote; shards are read on demand.
 
     Args:
-        folder: of the data set.
-        points: draw so many points of each cloud, always the same for one grasp, so that clouds make a batch; from a
-            smaller cloud some are drawn twice. None: all of them.
+        folder: folder of the data set.
+        points: number of points that are drawn from each cloud, equal in every call; a smaller cloud repeats points.
+            None: all points.
 
     Raises:
         ModelFileError: the campaign is not finished, or its card is damaged.
@@ -162,8 +159,7 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     >>> data[0]["points"].shape, data.jobs[0].object, data.job(0).row.grasps
     (torch.Size([100, 3]), 'carton', 1)
     """
-    most_card = 256 * 1024 * 1024  # most bytes of a card: a million jobs take 250 each
-    folder = Path(folder)
+    folder, most_card = Path(folder), 256 * 1024**2  # largest card in bytes
 
     def refuse(found: str, allowed: str) -> ModelFileError:
         return ModelFileError("folder", found, allowed)
@@ -173,19 +169,15 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     if missing := {"campaign", "jobs_in_shard", "jobs"} - set(fields):
         raise card.wrong(f"a file with {min(missing)!r}")
     fields["campaign"].text()
-    jobs, size = _read_jobs(fields["jobs"]), fields["jobs_in_shard"].whole(1, MOST)
+    jobs = tuple(read_row(row, bare=True) for row in fields["jobs"].items(MOST))
+    size = fields["jobs_in_shard"].whole(1, MOST)
     if lacking := sum(not shard_path(folder, k).is_file() for k in range(-(-len(jobs) // size))):
         raise refuse(f"{folder} without {lacking} of its shards", "all shards: run the campaign again")
     return GraspShards(folder, card.value, jobs, size, points)
 
 
-def _read_jobs(field: Field) -> tuple[JobRow, ...]:
-    """Read the rows of all jobs."""
-    return tuple(read_row(row, bare=True) for row in field.items(MOST))
-
-
 def _choose(points: Tensor, count: int | None, seed: int) -> Tensor:
-    """Draw so many points of a cloud."""
+    """Draw `count` points of a cloud; None: all points."""
     if count is None:
         return points
     generator = torch.Generator().manual_seed(seed)

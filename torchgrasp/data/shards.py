@@ -19,15 +19,14 @@ from torchgrasp.values import Grasps, check_grasps
 
 KIND = "grasp-shard"  # kind of the file
 MOST = 1_000_000  # most points, grasps and tries of one job
-LONGEST_META = 10_000  # letters of an entry of a grasp's metadata: the names of all joints are one
 
 
 class JobRow(NamedTuple):
-    """What came of a job.
+    """The outcome of a job.
 
-    `status` is OK, or why there is no grasp: the commonest failure, a bad object, or the end of its process. `note`
-    may say more. Of the `executable` grasps that were planned, `grasps` were kept and tried; `passed` of all tries
-    passed. The cloud has so many `points`. `meta` is that of `Grasps`.
+    `status` is OK, or the reason why there is no grasp; `note` holds details. `executable`, `grasps` and `passed` count
+    the planned grasps, the grasps that were tried, and the tries that passed. `points` counts the points of the cloud.
+    `meta` is the metadata of `Grasps`.
 
     >>> JobRow("mug", "view0", Status.NOT_CLOSED, points=1000).as_json()["status"]
     'NOT_CLOSED'
@@ -52,10 +51,10 @@ class JobRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Records(Value):
-    """The tensors of jobs, one job after the other.
+    """The tensors of jobs [m], job after job, in the object's frame.
 
-    Letters: p points, j jobs, g grasps, d tries of a grasp. A job without a camera has a viewpoint of zeros. `passed`
-    and `outcome` (a `Status`) are of each try in the simulator. Metres, in the object's frame.
+    Letters: p points, j jobs, g grasps, d tries of a grasp in the simulator. An unknown viewpoint is zero. `outcome` is
+    a `Status`.
     """
 
     points: Float[Tensor, "p 3"]
@@ -76,37 +75,30 @@ class Shard(NamedTuple):
         row, before = self.rows[i], self.rows[:i]
         p, g = sum(x.points for x in before), sum(x.grasps for x in before)
         points, grasps, records = slice(p, p + row.points), slice(g, g + row.grasps), self.records
-        taken = Records(
-            records.points[points],
-            records.viewpoints[i : i + 1],
-            records.grasps[grasps],
-            records.passed[grasps],
-            records.outcome[grasps],
-        )
-        return Shard((row,), taken)
+        tried = records.grasps[grasps], records.passed[grasps], records.outcome[grasps]
+        return Shard((row,), Records(records.points[points], records.viewpoints[i : i + 1], *tried))
 
 
 def join_shards(parts: Sequence[Shard]) -> Shard:
-    """Put shards one behind the other."""
+    """Return the shard of all jobs of some shards."""
     records = map_tensors(lambda *tensors: torch.cat(tensors), *(part.records for part in parts))
     return Shard(tuple(itertools.chain(*(part.rows for part in parts))), records)
 
 
 def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
-    """Return the bytes of a shard's file; `meta` says of which campaign."""
+    """Return the bytes of a shard's file; `meta` names its campaign."""
     jobs = json.dumps([row.as_json() for row in shard.rows])
     return pack_tensors(KIND, named_tensors(shard.records), {**meta, "jobs": jobs})
 
 
-def load_shard(path: Path, meta: dict[str, str] | None = None) -> Shard:
-    """Read a shard; `meta` is what its metadata must hold.
+def load_shard(path: Path, meta: dict[str, str]) -> Shard:
+    """Read a shard whose metadata hold `meta`.
 
     Raises:
         ModelFileError: the file is missing, damaged, or of another campaign.
     """
     records, found = read_value(path, KIND, Records)
-    if meta is not None and {key: found.get(key) for key in meta} != meta:
-        other = {key: found.get(key) for key in meta}
+    if (other := {key: found.get(key) for key in meta}) != meta:
         raise ModelFileError("path", f"{path} of {other}", f"a shard of {meta}")
 
     def refuse(found: str, allowed: str) -> ModelFileError:
@@ -127,10 +119,10 @@ def load_shard(path: Path, meta: dict[str, str] | None = None) -> Shard:
 
 
 def read_row(field: Field, bare: bool = False) -> JobRow:
-    """Read the row of a job from JSON; a `bare` one has no metadata.
+    """Read the row of a job from JSON; a `bare` row has no metadata.
 
     Raises:
-        ModelFileError: a field that is missing or of a wrong type or range.
+        ModelFileError: a missing field, or a field of a wrong type or range.
     """
     fields = field.entries()
     if missing := set(JobRow._fields) - ({"meta"} if bare else set()) - set(fields):
@@ -140,18 +132,12 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
     status = fields["status"].text()
     if status not in Status.__members__:
         raise fields["status"].wrong("the name of a Status")
-    meta = {} if bare else {key: _long_text(x) for key, x in fields["meta"].entries().items()}
+    longest_meta = 10_000  # letters of an entry of the metadata, which may name all joints
+    meta = {} if bare else {key: x.text(longest_meta) for key, x in fields["meta"].entries().items()}
     return JobRow(**texts, status=Status[status], **counts, meta=meta)  # pyright: ignore[reportArgumentType]
 
 
-def _long_text(field: Field) -> str:
-    """Return a text that may be a list of names."""
-    if not isinstance(field.value, str) or len(field.value) > LONGEST_META:
-        raise field.wrong(f"a text of at most {LONGEST_META} letters")
-    return field.value
-
-
 def short(text: str) -> str:
-    """Return a text on one line, cut to the length that a reader of rows accepts."""
+    """Return a text on one line, cut to the longest text that `read_row` accepts."""
     line = " ".join(text.split())
     return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."

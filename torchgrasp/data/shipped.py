@@ -17,25 +17,18 @@ if TYPE_CHECKING:
 
 __all__ = ["GraspObject", "list_objects", "load_object", "load_scene", "load_shipped_grasp"]
 
-DATA = Path(__file__).parent / "assets"
-"""Folder of the objects: `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`."""
-
+DATA = Path(__file__).parent / "assets"  # `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`
 SCENE = DATA / "scene.npz"  # a depth image of the objects on a table, with labels, camera and table
-
-MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
-"""Masses [kg]: a tin, a plastic jug, a plush rabbit, a bottle a third full."""
-
-GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", "barrett")}
-"""Objects and hands of which a grasp is shipped."""
+MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}  # masses [kg] of the objects
+GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", "barrett")}  # of the shipped grasps
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspObject:
-    """An object in metres, z up, resting at z = 0, with its mass [kg].
+    """A shipped object, z up, resting at z = 0: a closed mesh [m] and its mass [kg].
 
-    `mesh` is the true, closed surface. The union of the convex `parts` replaces it in simulation. `view` is a noisy
-    cloud from one side, with its viewpoint.
+    The convex `parts` replace the mesh in simulation. `view` is a noisy cloud from one side, with its viewpoint.
 
     >>> jug = load_object("jug")
     >>> jug.mass, [f"{1000 * side:.0f} mm" for side in jug.mesh.extents], len(jug.parts)
@@ -64,10 +57,6 @@ def load_object(name: str) -> GraspObject:
 
     Raises:
         BadArgument: no such object.
-
-    >>> jug = load_object("jug")
-    >>> jug.mesh.is_watertight, len(jug.view)
-    (True, 1000)
     """
     import trimesh
 
@@ -82,14 +71,14 @@ def load_object(name: str) -> GraspObject:
 
 @checked
 def load_shipped_grasp(name: str, hand: str) -> Grasps:
-    """Return one grasp that the library planned for its own object: something to close, draw and export at once.
+    """Return a shipped grasp of a shipped object.
 
     Args:
         name: "cylinder" or "jug".
         hand: "allegro" or "barrett".
 
     Raises:
-        BadArgument: no grasp of this object by this hand is shipped.
+        BadArgument: no such grasp.
 
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> grasp.joints.shape, grasp.certificate.closed

@@ -26,7 +26,7 @@ from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import household_mass
 from torchgrasp.closure import ClosureResult
 from torchgrasp.control.tactile import joint_jacobian
-from torchgrasp.data import list_views, read_mass
+from torchgrasp.data import list_views, read_entry
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import close_hand
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
@@ -85,7 +85,7 @@ def _lift(spec: TableSpec, subject: Subject, hand_name: str) -> Iterator[dict[st
         print(f"{subject.name}, {hand_name}: {error}", flush=True)
         return
     mesh, parts = read_solid(subject.folder, subject.name)
-    mass = household_mass(float(mesh.volume), read_mass(subject.folder, subject.name))
+    mass = household_mass(float(mesh.volume), read_entry(subject.folder, subject.name).mass)
     for friction in FRICTIONS if len(grasps) else ():
         seed = seed_of(spec.seed, subject.label, view, str(friction))
         for name, force in HOLDINGS.items():

@@ -26,7 +26,7 @@ from benchmarks.perturb import (
     perturb_trial,
     perturb_view,
 )
-from torchgrasp.data import list_views, read_mass, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import PROTOCOLS, PoseNoise, close_hand
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
@@ -192,7 +192,7 @@ def _lift(spec: TableSpec, subject: Subject, hand: str, name: str, force: float)
     began = time.process_time()
     mesh, parts = read_solid(folder, subject.name)
     view = list_views(folder, only=[subject.name])[0][1]
-    mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
+    mass = household_mass(float(mesh.volume), read_entry(folder, subject.name).mass)
     try:
         grasps = _best(plan_view(spec, subject, hand, view, name), spec.grasps)
     except GraspError as error:

@@ -38,7 +38,7 @@ from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import PERTURBATIONS, household_mass, perturb_trial
 from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand, plan_grasps
 from torchgrasp.closure import SensorModel
-from torchgrasp.data import list_views, read_mass, read_view
+from torchgrasp.data import list_views, read_entry, read_view
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, pull_grasp
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
@@ -225,7 +225,7 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: lis
         print(f"{subject.name}, {hand}: {error}", flush=True)
         return
     mesh, parts = read_solid(folder, subject.name)
-    mass = household_mass(float(mesh.volume), read_mass(folder, subject.name))
+    mass = household_mass(float(mesh.volume), read_entry(folder, subject.name).mass)
     shape, surface = _fit(folder, subject.name, view)
     for rank in choose_rows(len(grasps), spec.grasps, "spread"):
         seed = seed_of(spec.seed, subject.label, view, rank, 0)

@@ -13,7 +13,7 @@ from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
 from benchmarks.common import Options, Row, bench
-from torchgrasp.data import list_views, read_family, read_object_mesh, read_view
+from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import score
 from torchgrasp.evaluation.protocols import PROTOCOLS, draw_error, seed_of
@@ -173,7 +173,7 @@ def describe_trials(source: Path, name: str, hand: str, grasps: int, folder: Pat
     if not rows:
         return []
     shape = fit_shape(read_view(source, name, rows[0]["view"]), table=0.0)
-    center, family = extract_surface(shape).vertices.mean(0), read_family(source, name) or name
+    center, family = extract_surface(shape).vertices.mean(0), read_entry(source, name).family or name
     model, planned = load_hand(hand), load_grasps(grasps_at(source, name, hand, folder))
     frictions = [PROTOCOLS[TESTS[row["test"]][0]].trial.friction for row in rows]
     for friction in sorted(set(frictions)):

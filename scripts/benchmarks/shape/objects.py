@@ -15,7 +15,7 @@ from benchmarks.shape.accuracy import Row as View
 from benchmarks.shape.accuracy import format_groups, format_table, mean_row, measure_shape
 from benchmarks.shape.closure_survival import closure_survival
 from benchmarks.shape.walls import measure_walls
-from torchgrasp.data import read_family, read_group
+from torchgrasp.data import read_entry
 from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.shape.fit import fit_shape
 
@@ -65,7 +65,8 @@ def _measure(objects: Path, only: Sequence[str], support: Literal["camera", "pap
     views = []
     for name, view, cloud, mesh in tqdm(list(read_views(objects, views=only)), desc=support, disable=None, leave=False):
         found = fit_shape(cloud, support=support, table=0.0)
-        told = {"object": name, "view": view, "family": read_family(objects, name), "group": read_group(objects, name)}
+        entry = read_entry(objects, name)
+        told = {"object": name, "view": view, "family": entry.family, "group": entry.group}
         walls = measure_walls(found, mesh, cloud) if told["group"] == "shell" and support == "camera" else {}
         views.append(told | measure_shape(found, mesh, cloud) | closure_survival(found, mesh) | walls)
     return views

@@ -10,7 +10,7 @@ from benchmarks.ground_truth import read_views
 from benchmarks.perturb import PERTURBATIONS, find_perturbation, perturb_view
 from benchmarks.shape.accuracy import Row as View
 from benchmarks.shape.accuracy import measure_shape
-from torchgrasp.data import read_family, read_group
+from torchgrasp.data import read_entry
 from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.shape.fit import fit_shape
@@ -52,7 +52,8 @@ def _measure(objects: Path, views: tuple[str, ...], factor: str, seed: int) -> I
     perturbation = find_perturbation(factor)
     for name, view, cloud, mesh in tqdm(list(read_views(objects, views=views)), desc=factor, disable=None, leave=False):
         seen, table = perturb_view(cloud, perturbation, seed_of(seed, name, view))
-        told = {"object": name, "family": read_family(objects, name), "group": read_group(objects, name)}
+        entry = read_entry(objects, name)
+        told = {"object": name, "family": entry.family, "group": entry.group}
         yield told | measure_shape(fit_shape(seen, table=table), mesh, cloud)
 
 

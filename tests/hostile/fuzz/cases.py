@@ -20,7 +20,7 @@ from torchgrasp import (
 from torchgrasp.app.author.draft import new_hand
 from torchgrasp.cloud.depth import read_image, read_pose
 from torchgrasp.cloud.read import save_cloud
-from torchgrasp.data import list_entries, list_views, read_entry
+from torchgrasp.data import list_views, read_entries, read_entry
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
 from torchgrasp.geometry.mesh import read_mesh
@@ -124,7 +124,7 @@ def manifests(folder: Path) -> list[Case]:
     (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": cup | {"group": "shell"}, "jug": cup}}))
 
     def read(path: Path) -> None:
-        for name in list_entries(path.parent):
+        for name in read_entries(path.parent):
             read_entry(path.parent, name)
         list_views(path.parent)
 

@@ -1,6 +1,5 @@
 """`torchgrasp evaluate` and `torchgrasp campaign`: grasps tried in simulation, for shares or for a data set."""
 
-import contextlib
 import dataclasses
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ from torchgrasp.app.report.evaluation import SHARE_NAMES, write_evaluation
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
 from torchgrasp.checks import Count, Range, Seed
-from torchgrasp.data import JobRow, list_entries, list_views
+from torchgrasp.data import JobRow, read_entries
 from torchgrasp.errors import BadArgument, DatasetError, Status
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
@@ -102,11 +101,10 @@ class Evaluate(_Trials):
 def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
     """Return the object and the name of each view; an object without views has the view ""."""
     names = []
-    for name in list_entries(objects, spec.only):
-        views = [""]
-        with contextlib.suppress(DatasetError):  # a bad entry is refused when it is evaluated
-            views = [view for _, view in list_views(objects, spec.complete, [name], spec.views)] or views
-        names += [(name, view) for view in views]
+    for name, entry in read_entries(objects, spec.only).items():
+        bad = isinstance(entry, DatasetError)  # a bad entry is refused when it is evaluated
+        views = [] if bad else entry.list_views(spec.complete, spec.views)
+        names += [(name, view) for view in views or [""]]
     return names
 
 
