@@ -17,7 +17,7 @@ from torchgrasp.cloud.read import read_cloud
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.load import load_hand
-from torchgrasp.scene.scene import read_scene
+from torchgrasp.scene.file import read_scene
 from torchgrasp.values import Grasps
 
 

@@ -3,11 +3,12 @@ import pytest
 import torch
 import trimesh
 
+from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.scene import Scene
+from torchgrasp.scene import Scene, read_scene, save_scene
 from torchgrasp.values import PointCloud
 
 POSE = look_at(20.0, 45.0, 0.6)
@@ -177,3 +178,18 @@ def test_no_table_and_no_camera_are_refused(picture):
         Scene.from_depth(render_depth(things(), POSE, table=None)[0], K, POSE)
     with pytest.raises(BadArgument, match="viewpoint"):
         Scene.from_cloud(PointCloud(torch.rand(100, 3)))
+
+
+def test_other_supports_are_told_and_survive_a_file(tmp_path):
+    top, floor = box([0.5, 0.4, 0.02], [0.0, 0.0, -0.01]), box([4.0, 4.0, 0.01], [0.0, 0.0, -0.455])
+    stools = [box([0.2, 0.2, 0.2], [x, y, -0.35]) for x in (0.5, -0.6) for y in (-0.5, 0.5)]
+    cup = box([0.06, 0.06, 0.08], [0.0, 0.0, 0.04])
+    pose = look_at(0.0, 35.0, 1.0)
+    depth, _ = render_depth([top, floor, *stools, cup], pose, table=None)
+    scene = Scene.from_depth(depth, INTRINSICS, pose)
+    assert len(scene.supports) == 2 and len(scene.things) == 1
+    assert "another plane" in scene.advice[0]
+    again = read_scene(save_scene(scene, tmp_path / "scene.npz"))
+    assert again.supports[1].offset == scene.supports[1].offset and again.advice == scene.advice
+    on_floor = Scene.from_depth(depth, INTRINSICS, pose, table=scene.supports[1])
+    assert on_floor.supports == (scene.supports[1],) and len(on_floor.things) >= 4

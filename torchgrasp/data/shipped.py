@@ -9,7 +9,8 @@ import numpy as np
 from torchgrasp.checks import checked
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.errors import BadArgument
-from torchgrasp.scene.scene import Scene, read_scene
+from torchgrasp.scene.file import read_scene
+from torchgrasp.scene.scene import Scene
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 if TYPE_CHECKING:

@@ -1,9 +1,7 @@
 """A scene: objects on a table, as one camera saw them; from images and clouds, from and to files."""
 
 import dataclasses
-import io
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,9 +13,8 @@ from torchgrasp.checks import Pose, checked
 from torchgrasp.cloud.depth import read_depth
 from torchgrasp.cloud.support import find_table
 from torchgrasp.errors import BadArgument
-from torchgrasp.files import write_file
 from torchgrasp.geometry.plane import Plane, to_upright
-from torchgrasp.scene.image import DepthImage, image_of_cloud, read_arrays, read_image, read_labels
+from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image, read_labels
 from torchgrasp.scene.segment import label_image
 from torchgrasp.values import PointCloud
 
@@ -197,14 +194,17 @@ class Scene(Value):
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Problems of the picture, a sentence each: a target that the border of the image cuts off."""
-        if self.target is None:
-            return ()
-        pixels = self.pixels[self.rows_of()]
-        last = torch.tensor(self.image.depth.shape) - 1
-        if int(((pixels <= 1) | (pixels >= last - 1)).any(-1).sum()) < 5:  # fewer are noise
-            return ()
-        return ("the target is cut off at the border of the image: its other part is unknown; turn the camera to it",)
+        """Problems of the picture, a sentence each: several supports, a target at the border of the image."""
+        found = [
+            f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
+            for plane in self.others
+        ]
+        pixels, last = self.pixels[self.rows_of()], torch.tensor(self.image.depth.shape) - 1
+        if int(((pixels <= 1) | (pixels >= last - 1)).any(-1).sum()) >= 5:  # fewer are noise
+            found.append(
+                "the target is cut off at the border of the image: its other part is unknown; turn the camera to it"
+            )
+        return tuple(found)
 
     @property
     def supports(self) -> tuple[Plane, ...]:
@@ -253,64 +253,3 @@ class Scene(Value):
             table=None if self.table is None else Plane.horizontal(0.0),
             others=(),
         )
-
-
-@checked
-def read_scene(path: Path | str) -> Scene:
-    """Read a scene from a .npz file, as `Scene.from_depth` does.
-
-    It has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are `camera_pose` (4, 4), `labels`
-    or a `mask` of the target (h, w), the label `target`, and `table` (4,): normal and offset.
-
-    Raises:
-        CloudFileError: no such file, or malformed content.
-        BadArgument: as `Scene.from_depth`.
-
-    >>> import tempfile
-    >>> from torchgrasp import load_scene
-    >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).things
-    (1, 2, 3, 4)
-    """
-    arrays = read_arrays(Path(path))
-    table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
-    others = arrays.pop("others", np.empty((0, 4)))
-    plane, *rest = (
-        (Plane(torch.tensor(row[:3]), float(row[3])) for row in [table, *others]) if table is not None else [None]
-    )
-    scene = Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
-    scene = dataclasses.replace(scene, others=tuple(rest)) if rest else scene
-    return scene if target is None else scene.select(int(target))
-
-
-@checked
-def save_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a scene as .npz, atomically: depth in float32, labels, camera, table and target; `read_scene` reads it.
-
-    Raises:
-        BadArgument: another suffix.
-        OutputError: the file cannot be written.
-
-    >>> import tempfile
-    >>> from torchgrasp import load_scene
-    >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).things
-    (1, 2, 3, 4)
-    """
-    path, buffer = Path(path), io.BytesIO()
-    if path.suffix.lower() != ".npz":
-        raise BadArgument("path", path, "a file ending in .npz")
-    labels = np.zeros(scene.image.depth.shape, dtype=np.int32)
-    labels[tuple(scene.pixels.cpu().numpy().T)] = scene.labels.cpu().numpy()
-    arrays = {
-        "depth": scene.image.depth.cpu().numpy().astype(np.float32),
-        "intrinsics": scene.image.intrinsics.cpu().numpy(),
-        "camera_pose": scene.image.obj_from_camera.cpu().numpy(),
-        "labels": labels,
-    }
-    if scene.table is not None:
-        arrays["table"] = np.array([*scene.table.normal.tolist(), scene.table.offset])
-    if scene.others:
-        arrays["others"] = np.array([[*plane.normal.tolist(), plane.offset] for plane in scene.others])
-    if scene.target is not None:
-        arrays["target"] = np.array(scene.target)
-    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-    return write_file(path, buffer.getvalue())

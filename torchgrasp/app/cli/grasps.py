@@ -37,8 +37,8 @@ from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.problem import take_target
 from torchgrasp.planner.scene import plan_scene
+from torchgrasp.scene import Scene, read_scene
 from torchgrasp.scene.image import is_scene
-from torchgrasp.scene.scene import Scene, read_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, TrialSpec
 

@@ -1,0 +1,76 @@
+"""Scenes in files: a .npz with depth, labels, camera, supports and target."""
+
+import dataclasses
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchgrasp.checks import checked
+from torchgrasp.errors import BadArgument
+from torchgrasp.files import write_file
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.scene.image import read_arrays
+from torchgrasp.scene.scene import Scene
+
+
+@checked
+def read_scene(path: Path | str) -> Scene:
+    """Read a scene from a .npz file, as `Scene.from_depth` does.
+
+    It has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are `camera_pose` (4, 4), `labels`
+    or a `mask` of the target (h, w), the label `target`, and `table` (4,): normal and offset.
+
+    Raises:
+        CloudFileError: no such file, or malformed content.
+        BadArgument: as `Scene.from_depth`.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_scene
+    >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).things
+    (1, 2, 3, 4)
+    """
+    arrays = read_arrays(Path(path))
+    table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
+    others = arrays.pop("others", np.empty((0, 4)))
+    plane, *rest = (
+        (Plane(torch.tensor(row[:3]), float(row[3])) for row in [table, *others]) if table is not None else [None]
+    )
+    scene = Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
+    scene = dataclasses.replace(scene, others=tuple(rest)) if rest else scene
+    return scene if target is None else scene.select(int(target))
+
+
+@checked
+def save_scene(scene: Scene, path: Path | str) -> Path:
+    """Write a scene as .npz, atomically: depth in float32, labels, camera, table and target; `read_scene` reads it.
+
+    Raises:
+        BadArgument: another suffix.
+        OutputError: the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_scene
+    >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).things
+    (1, 2, 3, 4)
+    """
+    path, buffer = Path(path), io.BytesIO()
+    if path.suffix.lower() != ".npz":
+        raise BadArgument("path", path, "a file ending in .npz")
+    labels = np.zeros(scene.image.depth.shape, dtype=np.int32)
+    labels[tuple(scene.pixels.cpu().numpy().T)] = scene.labels.cpu().numpy()
+    arrays = {
+        "depth": scene.image.depth.cpu().numpy().astype(np.float32),
+        "intrinsics": scene.image.intrinsics.cpu().numpy(),
+        "camera_pose": scene.image.obj_from_camera.cpu().numpy(),
+        "labels": labels,
+    }
+    if scene.table is not None:
+        arrays["table"] = np.array([*scene.table.normal.tolist(), scene.table.offset])
+    if scene.others:
+        arrays["others"] = np.array([[*plane.normal.tolist(), plane.offset] for plane in scene.others])
+    if scene.target is not None:
+        arrays["target"] = np.array(scene.target)
+    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+    return write_file(path, buffer.getvalue())
