@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.cloud.depth import check_rigid, cloud_from_depth
+from torchgrasp.cloud.sensor import SensorName, SensorNoise, add_noise, find_sensor
 from torchgrasp.errors import MeshError
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.values import PointCloud
@@ -65,19 +65,19 @@ def partial_view(
     mesh: "trimesh.Trimesh",
     camera_pose: Float[Tensor, "4 4"],
     n: Annotated[int, Range(4, 1000000)] = 1000,
-    noise: bool = True,
+    noise: bool | SensorName | SensorNoise = True,
     seed: Seed = 0,
 ) -> PointCloud:
     """Return n points [m] of a mesh that the default camera sees, with a viewpoint and without normals.
 
-    The noise is that of an active stereo camera: noise and steps of the disparity, a smooth bias, flying and missing
-    pixels at rims, and surfaces that fade out at grazing angles.
+    By default the noise is that of an active stereo camera: noise and steps of the disparity, a smooth bias, flying and
+    missing pixels at rims, and surfaces that fade out at grazing angles.
 
     Args:
         mesh: in the object frame [m].
         camera_pose: obj_from_camera, see `look_at`.
         n: points drawn from the pixels; all pixels if there are fewer.
-        noise: False: exact depths.
+        noise: False: exact depths; or the name of a camera, or its `SensorNoise`.
         seed: of noise and choice of points.
 
     Raises:
@@ -93,8 +93,8 @@ def partial_view(
     pose = check_rigid("camera_pose", camera_pose).double()
     depth, cosine = cast_mesh(mesh, pose)
     generator = torch.Generator().manual_seed(seed)
-    if noise:
-        depth = add_noise(depth, cosine, generator)
+    if (sensor := find_sensor(noise)) is not None:
+        depth = add_noise(depth, cosine, generator, sensor)
     cloud = cloud_from_depth(depth, INTRINSICS, camera_pose=pose)
     rows = torch.randperm(len(cloud), generator=generator)[:n]
     return cloud.select(rows)
@@ -137,36 +137,12 @@ def _in_image_box(
     return (x >= u.min() - margin) & (x <= u.max() + margin) & (y >= v.min() - margin) & (y <= v.max() + margin)
 
 
-def add_noise(
-    depth: Float[Tensor, "h w"], cosine: Float[Tensor, "h w"], generator: torch.Generator
-) -> Float[Tensor, "h w"]:
-    """Add the noise that `partial_view` describes to a depth image [m]."""
-    from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
-
-    normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
-    uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)
-    measured = depth > 0
-    scale = FOCAL * 0.055  # [px m], of a stereo camera whose eyes are 55 mm apart
-    disparity = scale / torch.where(measured, depth, 1.0) + 0.12 * normal()
-    noisy = scale / (torch.round(32 * disparity) / 32).clamp_min(1 / 32)
-    smooth = torch.from_numpy(gaussian_filter(normal().numpy(), 12.0))
-    noisy = noisy + 0.0008 * smooth / smooth.std()
-    # A rim pixel has, within two pixels, background or a surface more than 10 mm away.
-    far = torch.from_numpy(maximum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
-    near = torch.from_numpy(minimum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
-    rim = (far - depth > 0.010) | (depth - near > 0.010)
-    noisy = noisy + torch.where(rim & (uniform() < 0.25), -0.008 * torch.log1p(-uniform()), 0.0)
-    angle = torch.rad2deg(torch.arccos(cosine.clamp(0.0, 1.0)))
-    lost = (rim & (uniform() < 0.35)) | (uniform() < 0.01) | (uniform() < (angle - 72.5) / (87.0 - 72.5))
-    return torch.where(measured & ~lost, noisy, 0.0)
-
-
 def render_depth(
     meshes: "Sequence[trimesh.Trimesh]",
     camera_pose: Float[Tensor, "4 4"],
     *,
     table: float | None = 0.0,
-    noise: bool = True,
+    noise: bool | SensorName | SensorNoise = True,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
     """Return a depth image [m] of meshes on a table, as the default camera measures it, and exact labels.
@@ -178,7 +154,7 @@ def render_depth(
         meshes: in the world frame [m].
         camera_pose: world_from_camera, see `look_at`.
         table: height z of the table [m]; None: no table.
-        noise: add the noise of `partial_view` to the depths.
+        noise: as in `partial_view`.
         seed: of the noise.
 
     Raises:
@@ -194,8 +170,8 @@ def render_depth(
         depth, cosine = torch.where(nearer, z, depth), torch.where(nearer, against, cosine)
         labels[nearer] = label
     depth = torch.where(torch.isfinite(depth), depth, 0.0)
-    if noise:
-        depth = add_noise(depth, cosine, torch.Generator().manual_seed(seed))
+    if (sensor := find_sensor(noise)) is not None:
+        depth = add_noise(depth, cosine, torch.Generator().manual_seed(seed), sensor)
     return depth, labels
 
 

@@ -1,0 +1,118 @@
+"""The noise of depth cameras: added to exact images, and estimated from real ones."""
+
+import dataclasses
+import types
+from functools import partial
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.checks import checked
+
+SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
+"""Depth cameras with a model of their noise."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class SensorNoise(Value):
+    """The noise of a depth camera: random, in steps, smooth, at rims, in corners and on slanted surfaces.
+
+    >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
+    True
+    """
+
+    base: float = 0.0  # focal length times baseline [px m]; 0: time of flight
+    disparity: float = 0.0  # standard deviation of the disparity [px]
+    step: float = 0.0  # between two values of the disparity [px]; 0: none
+    floor: float = 0.0  # standard deviation [m] at any distance
+    growth: float = 0.0  # of time of flight: standard deviation over the squared distance [1/m]
+    grain: float = 0.0  # width of the patches in which pixels have similar noise [px]; 0: each has its own
+    bias: float = 0.0008  # standard deviation of the smooth bias [m]
+    bias_width: float = 12.0  # width of the patches of the bias [px]
+    shadow: bool = False  # whether the second camera or projector misses surfaces beside nearer ones
+    flying: float = 0.25  # share of flying pixels at rims
+    flight: float = 0.008  # mean distance of flying pixels behind the rim [m]
+    lost_rim: float = 0.35  # share of rim pixels without depth
+    lost: float = 0.01  # share of all pixels without depth
+    grazing: tuple[float, float] = (72.5, 87.0)  # angle of ray and normal [deg] at which pixels fade, and are gone
+    multipath: float = 0.0  # excess of depth in a corner, over the corner's depth behind its surroundings
+
+    def sigma(self, depth: Tensor) -> Tensor:
+        """Return the standard deviation [m] of the random noise at a depth [m], without bias and steps."""
+        growth = self.disparity / self.base if self.base else self.growth
+        return torch.sqrt(self.floor**2 + (growth * depth * depth) ** 2)
+
+
+ACTIVE_STEREO = SensorNoise(base=616.0 * 0.055, disparity=0.12, step=1 / 32)
+"""An active stereo camera whose eyes are 55 mm apart, with independent noise of its pixels: `noise=True`."""
+
+SENSORS = types.MappingProxyType({
+    # Intel's tuning guide of the D400: about 0.08 px of subpixel noise, 50 mm baseline; patches as in public frames.
+    "realsense": SensorNoise(30.8, 0.08, 1 / 32, grain=5.0, bias=0.0015, bias_width=30.0, shadow=True),
+    # Khoshelham and Oude Elberink 2012: 0.00143 z^2 in all, steps of 1/8 px; 580 px and 75 mm.
+    "kinect_v1": SensorNoise(43.5, 0.05, 1 / 8, grain=2.0, bias=0.0014, bias_width=30.0, shadow=True),
+    # Toelgyessy et al. 2021: below 17 mm and 11 mm of bias up to 3.5 m; flying pixels and multipath of time of flight.
+    "azure": SensorNoise(floor=0.001, growth=0.0005, bias=0.002, bias_width=30.0, flying=0.6, lost_rim=0.2, multipath=0.3),
+    # Zivid's data sheet of the Two M70: point precision 0.055 mm at 0.7 m.
+    "zivid": SensorNoise(growth=0.00011, bias=0.0001, bias_width=30.0, flying=0.05, lost_rim=0.5, lost=0.02),
+})  # fmt: skip
+"""Noise of known cameras, by name."""
+
+
+def find_sensor(noise: bool | SensorName | SensorNoise) -> SensorNoise | None:
+    """Return the noise of a camera by name; True: an active stereo camera, False: None."""
+    if isinstance(noise, bool):
+        return ACTIVE_STEREO if noise else None
+    return SENSORS[noise] if isinstance(noise, str) else noise
+
+
+def add_noise(
+    depth: Float[Tensor, "h w"],
+    cosine: Float[Tensor, "h w"],
+    generator: torch.Generator,
+    sensor: SensorNoise = ACTIVE_STEREO,
+) -> Float[Tensor, "h w"]:
+    """Add a camera's noise to a depth image [m], given |cosine| of ray and normal."""
+    from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
+    normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
+    uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)
+
+    def patches(std: float, width: float) -> Tensor:
+        field = torch.from_numpy(gaussian_filter(normal().numpy(), width))
+        return std * field / field.std()
+
+    measured = depth > 0
+    own = patches(1.0, sensor.grain) if sensor.grain else normal()
+    noisy = _random_noise(torch.where(measured, depth, 1.0), own, sensor) + patches(sensor.bias, sensor.bias_width)
+    # A rim pixel has, within two pixels, background or a surface more than 10 mm away.
+    far = torch.from_numpy(maximum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
+    near = torch.from_numpy(minimum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
+    rim = (far - depth > 0.010) | (depth - near > 0.010)
+    flies = rim & (uniform() < sensor.flying)
+    noisy = noisy + torch.where(flies, -sensor.flight * torch.log1p(-uniform()), 0.0)
+    if sensor.multipath:  # light by way of the walls of a corner takes longer
+        around = torch.from_numpy(gaussian_filter(depth.numpy(), 8.0))
+        excess = (depth - around).clamp_min(0.0)
+        noisy = noisy + sensor.multipath * torch.where(excess < 0.01, excess, 0.0)
+    angle = torch.rad2deg(torch.arccos(cosine.clamp(0.0, 1.0)))
+    low, high = sensor.grazing
+    lost = (rim & (uniform() < sensor.lost_rim)) | (uniform() < sensor.lost)
+    lost = lost | (uniform() < (angle - low) / (high - low))
+    if sensor.shadow:
+        column = torch.arange(depth.shape[1], dtype=torch.float64)
+        second = column - torch.where(measured, sensor.base / depth, 0.0)  # column in the other eye's image
+        lost = lost | (second.flip(1).cummin(1).values.flip(1) < second)
+    return torch.where(measured & ~lost, noisy, 0.0)
+
+
+def _random_noise(depth: Tensor, normal: Tensor, sensor: SensorNoise) -> Tensor:
+    """Return depths [m] with the random noise of a camera, in its steps."""
+    if not sensor.base:
+        return depth + sensor.sigma(depth) * normal
+    disparity = sensor.base / depth + sensor.disparity * normal
+    return sensor.base / (torch.round(disparity / sensor.step) * sensor.step).clamp_min(sensor.step)
