@@ -4,8 +4,8 @@ import functools
 
 import pytest
 import torch
-
 from benchmarks.scene.rooms import KINDS, Room, rooms
+
 from torchgrasp.scene.image import DepthImage
 
 
