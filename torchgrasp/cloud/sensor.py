@@ -56,7 +56,7 @@ SENSORS = types.MappingProxyType({
     # Khoshelham and Oude Elberink 2012: 0.00143 z^2 in all, steps of 1/8 px; 580 px and 75 mm.
     "kinect_v1": SensorNoise(43.5, 0.05, 1 / 8, grain=2.0, bias=0.0014, bias_width=30.0, shadow=True),
     # Toelgyessy et al. 2021: below 17 mm and 11 mm of bias up to 3.5 m; flying pixels and multipath of time of flight.
-    "azure": SensorNoise(floor=0.001, growth=0.0005, bias=0.002, bias_width=30.0, flying=0.6, lost_rim=0.2, multipath=0.3),
+    "azure": SensorNoise(floor=0.001, growth=0.0005, bias=0.002, bias_width=30.0, flying=0.6, multipath=0.3),
     # Zivid's data sheet of the Two M70: point precision 0.055 mm at 0.7 m.
     "zivid": SensorNoise(growth=0.00011, bias=0.0001, bias_width=30.0, flying=0.05, lost_rim=0.5, lost=0.02),
 })  # fmt: skip
