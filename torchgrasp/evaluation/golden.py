@@ -1,6 +1,7 @@
-"""The golden set: shipped grasps with known verdicts, which check that the simulators of an installation work.
+"""The golden set: shipped grasps with known verdicts, to check that an installed simulator works.
 
-`scripts/train.py golden` makes the grasps. For the verdict "lost" the hand stands 60 mm off, and the fingers miss.
+`scripts/train.py golden` makes the grasps. In the cases with the verdict "lost" the hand is displaced by 60 mm, so that
+the fingers miss the object.
 """
 
 import dataclasses
@@ -17,7 +18,7 @@ from torchgrasp.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A grasp of a shipped object; `held` is the expected verdict."""
+    """A shipped grasp of a shipped object; `held` is the expected verdict."""
 
     object: str
     hand: str
@@ -36,7 +37,7 @@ GOLDEN = (
 
 
 class GoldenResult(NamedTuple):
-    """A case and its simulated verdict; `seconds` is wall time."""
+    """A golden case and its verdict in simulation; `seconds` is wall time."""
 
     case: GoldenCase
     held: bool
@@ -44,13 +45,13 @@ class GoldenResult(NamedTuple):
 
     @property
     def right(self) -> bool:
-        """Whether the verdict is as expected."""
+        """Whether the simulated verdict is the expected one."""
         return self.held == self.case.held
 
 
 @checked
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
-    """Yield the result of each case of `GOLDEN` in a simulator.
+    """Simulate each case of `GOLDEN`, and yield the results.
 
     Raises:
         MissingExtra: the simulator is not installed.

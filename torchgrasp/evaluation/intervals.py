@@ -1,7 +1,7 @@
-"""Shares and their 95 % intervals, by a bootstrap over families of objects.
+"""Success rates and their 95 % intervals, by a bootstrap over families of objects.
 
-Trials of one object are correlated, and objects of one family are correlated. The bootstrap therefore resamples whole
-families, 10 000 times. The interval lies between the 2.5 % and 97.5 % quantiles.
+Trials of one object are correlated, and so are objects of one family. The bootstrap therefore resamples whole families,
+10 000 times. The interval lies between the 2.5 % and 97.5 % quantiles.
 """
 
 import math
@@ -19,9 +19,9 @@ Counts = Mapping[str, tuple[int | float, int]]
 
 
 class Share(NamedTuple):
-    """A share or a difference of shares, its 95 % interval, and the numbers of trials and of units.
+    """A success rate, mean or difference, with its 95 % interval, and the numbers of trials and of resampled units.
 
-    The interval of a single unit is NaN. Without trials all values are NaN.
+    With a single unit the interval is NaN. Without trials all values are NaN.
     """
 
     value: float
@@ -33,7 +33,7 @@ class Share(NamedTuple):
 
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
-    """Return the counts of outcomes, each with the name of its unit."""
+    """Return passed and total trials for each unit, given pairs of unit name and outcome."""
     counts: dict[str, tuple[int, int]] = {}
     for name, passed in outcomes:
         before = counts.get(name, (0, 0))
@@ -43,9 +43,9 @@ def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]
 
 @checked
 def share_over(counts: Counts, seed: Seed = 0) -> Share:
-    """Return the share of passed trials, with its interval over the units.
+    """Return the success rate over all trials, with its interval over the units.
 
-    Where all trials passed, or none, the bootstrap has no width. The interval is then the one-sided 95 % bound of n
+    If all trials passed, or none, the bootstrap has no width. The interval is then the one-sided 95 % bound of n
     independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
     """
     found = contrast_over([counts], [1.0], seed)
@@ -57,7 +57,7 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
 @checked
 def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
-    """Return the mean of numbers, each with the name of its unit, with its interval; NaN values do not count."""
+    """Return the mean of values, with its interval over units, given pairs of unit name and value; NaN is left out."""
     sums: dict[str, tuple[float, int]] = {}
     for name, value in values:
         if not math.isnan(value):
@@ -68,7 +68,7 @@ def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
 
 @checked
 def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
-    """Return the first share minus the second share, paired by unit.
+    """Return the first success rate minus the second, with an interval paired by unit.
 
     An interval of zero width means that the units agree, not that the difference is exact.
     """
@@ -77,9 +77,9 @@ def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
 
 @checked
 def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
-    """Return a weighted sum of shares over the same resampled units.
+    """Return a weighted sum of success rates, with its interval over common resampled units.
 
-    `total` counts the trials of the first column. Resamples without a trial in some column do not count.
+    `total` counts the trials of the first column. Resamples in which a column has no trial are left out.
     """
     resamples = 10_000  # number of resamples behind an interval
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
@@ -99,13 +99,13 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
 
 
 def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[Tensor, "*r"]:
-    """Return the weighted sum of the columns' shares; NaN where a column has no trial."""
+    """Return the weighted sum of the columns' success rates; NaN where a column has no trial."""
     return (sums[..., 0] / sums[..., 1]) @ sums.new_tensor(weights)
 
 
 @checked
 def format_share(share: Share, unit: str = "families") -> str:
-    """Return a share in words."""
+    """Return a success rate with its interval as text."""
     if math.isnan(share.value):
         return "nothing measured"
     value = f"{100 * share.value:.1f} %"

@@ -1,4 +1,4 @@
-"""A simulated lift of the true object."""
+"""A simulated trial: approach, closing, lift and hold of the true object."""
 
 import math
 import time
@@ -50,24 +50,24 @@ def close_hand(
     """Close a hand on the true object, lift it and hold it, in simulation.
 
     The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises and holds. The object
-    is **held** under three conditions: its centre rose by half the lift, two fingers touch it at the end, and it
-    slipped by less than 20 mm and 30 degrees in the closed hand. Equal arguments give equal bits.
+    is **held** if its centre rose by half the lift, two fingers touch it at the end, and it slipped by less than 20 mm
+    and 30 degrees in the closed hand. Equal arguments give bitwise equal results.
 
     Args:
-        grasp: one row.
+        grasp: a single grasp.
         hand: the hand of the grasp.
         mesh: the true object [m], closed, in the frame of the grasp: a trimesh or a file.
-        spec: of the trial; None: `TrialSpec()`.
-        seed: of the tactile sensor's noise.
+        spec: parameters of the trial; None: `TrialSpec()`.
+        seed: random seed of the tactile sensors' noise.
         error: true pose of the hand in its planned frame, unknown to the controller; None: the planned pose.
         parts: convex parts of the mesh; None: they are computed (`convex_parts`).
         table: the table below the object, in the frame of the grasp; None: horizontal, at the mesh's lowest point.
         neighbours: other bodies on the table, which the hand may push.
-        surface: estimated surface of the object (`surface_field`) with which contacts are compared to estimate the
-            object's pose; None: the tangent planes of the planned contacts.
+        surface: estimated surface of the object (`surface_field`), to estimate the object's pose from touches; None:
+            only the tangent planes of the planned contacts are used.
 
     Raises:
-        BadArgument: not exactly one row, joints of another hand, or a pre-grasp outside the joint limits.
+        BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint limits.
         BadArgument: an approach that is no unit vector, or an error that is no finite (4, 4).
         BadArgument: the holding "law" for a closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
@@ -86,12 +86,12 @@ def close_hand(
 @checked
 @single_threaded
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
-    """Run a trial; see `close_hand`."""
+    """Run a lift trial; see `close_hand`."""
     return run_lift(TrialDriver(trial, TrialSpec() if spec is None else spec))
 
 
 def run_lift(driver: TrialDriver) -> ClosureResult:
-    """Close, lift and hold in a fresh scene."""
+    """Run a lift trial in a fresh scene."""
     started = time.perf_counter()
     lift = _Lift(driver.open())
     status = lift.perform()
@@ -99,14 +99,14 @@ def run_lift(driver: TrialDriver) -> ClosureResult:
 
 
 class _ObjectLost(Exception):
-    """The object is out of reach."""
+    """Raised when the object is too far away to continue the trial."""
 
 
 class _Tick(NamedTuple):
-    """The simulated state at a tick.
+    """The simulated state at one control tick.
 
-    `touching` counts fingers on the object, `centre` is the object's mass centre [m]. `contact` has force, point,
-    normal, sliding speed and blend of each finger. `felt` has the estimated friction and load.
+    `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `contact` holds force, point,
+    normal, sliding speed and blend of each finger. `felt` holds the controller's estimates of friction and load.
     """
 
     time: float
@@ -122,7 +122,7 @@ class _Tick(NamedTuple):
 
 
 class _Lift:
-    """A lift under way, and the record of its ticks."""
+    """One lift trial and the record of its ticks."""
 
     def __init__(self, run: TrialRun) -> None:
         self.run, self.spec = run, run.spec
@@ -132,7 +132,7 @@ class _Lift:
         self.pressed: int | None = None
 
     def perform(self) -> Status:
-        """Approach, close, press, lift and hold; return the status of the trial."""
+        """Run all phases of the trial - approach, closing, pressing, lift and hold; return its status."""
         run = self.run
         self._record()
         if not run.starts:
@@ -163,7 +163,7 @@ class _Lift:
         return self._verdict()
 
     def _put_down(self, time: float, rising: float) -> Status:
-        """Lower the hand in the time [s] of the rise so far."""
+        """Lower the hand in as much time [s] as it has risen; return the status of a load that is too heavy."""
         height, _ = self._height(time, rising)
         ticks = self.run.robot.ticks(min(time, rising))
         for k in range(ticks):
@@ -174,7 +174,7 @@ class _Lift:
         return Status.TOO_HEAVY if self._moved() < PUSHED_DISTANCE else Status.DROPPED
 
     def _height(self, time: float, rising: float) -> tuple[float, float]:
-        """Return height [m] and speed [m/s] of a hand that rises for `rising` seconds."""
+        """Return target height [m] and speed [m/s] at a time, for a rise of `rising` seconds and then shaking."""
         rate_hz = 5.0  # frequency of the shaking [Hz]
         share, rate = smooth_step(min(time / rising, 1.0))
         height = self.spec.lift_height * share
@@ -185,7 +185,7 @@ class _Lift:
         return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)
 
     def _record(self) -> None:
-        """Append a tick; raise an error if the simulation diverged or the object is out of reach."""
+        """Record a tick; raise an error if the simulation has diverged or the object is too far away."""
         robot, scene = self.run.robot, self.run.scene
         now, touching, pose = robot.steps * self.spec.timestep, int(robot.finger.sum()), scene.object_pose()
         centre = pose[:3, :3] @ scene.centre + pose[:3, 3]
@@ -202,7 +202,7 @@ class _Lift:
             raise _ObjectLost
 
     def _moved(self) -> float:
-        """Return the distance [m] of the object's centre from its start."""
+        """Return the distance [m] of the object's centre of mass from its start."""
         return float(np.linalg.norm(self.ticks[-1].centre - self.ticks[0].centre))
 
     def _all_touched(self) -> bool:
@@ -210,7 +210,7 @@ class _Lift:
         return self.run.controller.hold is not None or bool(np.isfinite(self.run.robot.first_touch).all())
 
     def _verdict(self) -> Status:
-        """Return whether the object is held, or the first failure."""
+        """Return the status of a completed trial: held, or the first failure."""
         judged_time = 0.2  # time [s] at the end of a trial in which contacts are counted
         rise = np.array([tick.centre[2] - self.ticks[0].centre[2] for tick in self.ticks])
         half = 0.5 * self.spec.lift_height
@@ -227,7 +227,7 @@ class _Lift:
         return Status.DROPPED if rise.max() >= half else Status.NOT_LIFTED
 
     def _motion(self, first: int | None, last: int | None, in_hand: bool = True) -> ObjectMotion:
-        """Return the object's motion between two ticks, in the hand or the world; NaN if a tick was not reached."""
+        """Return the object's motion between two ticks, relative to the hand or the world; NaN if a tick is None."""
         if first is None or last is None:
             return ObjectMotion(math.nan, math.nan)
         start, end = (torch.from_numpy(self.ticks[k].object_pose) for k in (first, last))
@@ -240,7 +240,7 @@ class _Lift:
         return ObjectMotion(distance, float(rotation_angle(start[:3, :3].T @ end[:3, :3])))
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
-        """Return the record as a value."""
+        """Return the record of the trial as a `ClosureResult`."""
         columns = [torch.from_numpy(np.stack(column)) for column in zip(*self.ticks, strict=True)]
         time, forces, object_pose, hand_pose, neighbour_pose, joints, *_, contact, felt = columns
         reached = [math.nan if k is None else float(time[k]) for k in (self.arrived, self.touched, self.pressed)]

@@ -1,4 +1,4 @@
-"""Tests of a grasp: lifts, and published pulls at the object's mass centre, without table and gravity."""
+"""Test protocols of grasps: lifts, and published pulls at the object's centre of mass without table and gravity."""
 
 import dataclasses
 import hashlib
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """Uniform errors along and about each axis, at most [m, rad]; `draws` a grasp.
+    """Uniform pose errors along and about each axis, at most [m, rad]; `draws` is the number of draws for each grasp.
 
     >>> PoseNoise(translation=0.005, rotation=math.radians(5)).draws
     1
@@ -38,7 +38,7 @@ class PoseNoise(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """Pulls by a force over mass [m/s^2], and the motion allowed [m, rad].
+    """A pull, as force over mass [m/s^2] for some seconds, and the largest allowed motion of the object [m, rad].
 
     >>> find_protocol("dexgraspbench").pull.acceleration
     10.0
@@ -53,9 +53,9 @@ class PullSpec(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """A test of a grasp: a trial that pulls at the object, or lifts it.
+    """A test protocol of grasps: trials that pull at the object, or that lift it.
 
-    Pulls have `noise` in the hand's pose, lifts in the object's.
+    In pulls `noise` displaces the hand, in lifts the object.
     """
 
     name: str
@@ -113,7 +113,7 @@ PROTOCOLS = {
 
 @checked
 def find_protocol(protocol: Protocol | str) -> Protocol:
-    """Return a protocol by its name, or as it is.
+    """Return a protocol, given its name or the protocol itself.
 
     Raises:
         BadArgument: an unknown name.
@@ -130,7 +130,7 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
 
 @checked
 def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]:
-    """Return the true pose of a hand from its planned pose and the error in it, on the CPU in float64.
+    """Return the true pose of a hand, given its planned pose and the pose error, on the CPU in float64.
 
     Raises:
         BadArgument: an error that is no finite (4, 4).
@@ -141,9 +141,9 @@ def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]
 
 @checked
 def seed_of(seed: Seed, *names: str | int) -> int:
-    """Return the seed of one draw: a hash of the campaign's seed and of what the draw is for.
+    """Return the random seed for one purpose: a hash of the evaluation's seed and the names of the purpose.
 
-    Draws for another object, view, row or repetition are independent, whatever else is drawn and in which order.
+    Draws for different objects, views, grasps or repetitions are independent of each other and of their order.
     """
     digest = hashlib.sha256(json.dumps([seed, *names]).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
@@ -151,7 +151,7 @@ def seed_of(seed: Seed, *names: str | int) -> int:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Return random errors of the hand's pose, each a transform in the frame of the planned hand."""
+    """Return random pose errors of the hand, each a transform in the frame of the planned hand."""
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
     drawn = 2 * torch.rand(count, 6, generator=generator, dtype=torch.float64) - 1
@@ -161,7 +161,7 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 
 @checked
 def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Draw poses of an object that moves on its table and turns about the vertical through `pivot` [m]; on the CPU."""
+    """Return random displacements of an object along its table and about the vertical through `pivot` [m]."""
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
@@ -171,13 +171,13 @@ def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count,
 
 
 def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tensor, "4 4"]:
-    """Return the error of a hand whose object is elsewhere."""
+    """Return the hand's pose error that is equivalent to a displacement of the object."""
     return inverse(obj_from_hand) @ inverse(object_pose) @ obj_from_hand
 
 
 @checked
 def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed) -> Float[Tensor, "4 4"]:
-    """Draw the hand's error for one trial of a grasp, by a seed of its own (`seed_of`)."""
+    """Return the random pose error of the hand for one trial of a grasp, with its own seed (`seed_of`)."""
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
     pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)

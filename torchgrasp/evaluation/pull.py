@@ -1,4 +1,4 @@
-"""Pulls at a grasped object in six directions, and trials under a protocol."""
+"""Trials that pull at a grasped object in six directions, and trials under any protocol."""
 
 import dataclasses
 import math
@@ -26,10 +26,10 @@ DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """Whether the object stayed in all directions, and its largest motion [m, rad].
+    """The result of a pull trial: whether the object stayed in all directions, and its largest motion [m, rad].
 
-    `status` is of the last of the `directions` that were tried. `force` [N] is the fingers' mean normal force before
-    the first pull, or NaN. `seconds` is CPU time.
+    `status` is that of the last of the `directions` that were tried. `force` [N] is the fingers' mean normal force
+    before the first pull, or NaN. `seconds` is CPU time.
     """
 
     passed: bool
@@ -67,7 +67,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Pull in each direction, in fresh scenes, until a pull fails."""
+    """Pull in each direction, each in a fresh scene, until a pull fails."""
     started = time.process_time()
     status, largest, force, tried = Status.OK, np.zeros(2), math.nan, 0
     while status is Status.OK and tried < len(DIRECTIONS):
@@ -79,7 +79,7 @@ def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
 
 
 def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status, np.ndarray, float]:
-    """Close the hand and pull; return status, largest motion [m, rad], and the force [N] before the pull."""
+    """Close the hand and pull in one direction; return status, largest motion [m, rad], and force [N] before it."""
     interval = 0.2  # interval [s] at which the pulled object's motion is checked
     if not run.starts:
         return Status.START_OVERLAP, np.zeros(2), math.nan
@@ -103,7 +103,7 @@ def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status,
 
 
 def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.ndarray]:
-    """Return a status and the object's motion [m, rad] from its start."""
+    """Return whether the object's motion is allowed, as a status, and the motion [m, rad] from its start."""
     pose, centre = run.scene.object_pose(), np.append(run.scene.centre, 1.0)
     if not np.isfinite(pose).all():
         return Status.UNSTABLE, np.full(2, math.inf)
@@ -120,7 +120,7 @@ def run_protocol(
     rank: Annotated[int, Range(0, 1000000)] = 0,
     draw: Annotated[int, Range(0, 1000000)] = 0,
 ) -> ProtocolResult:
-    """Try one grasp under a protocol; see `pull_grasp` and `lift_grasp`."""
+    """Run one trial of a grasp under a protocol; see `pull_grasp` and `lift_grasp`."""
     started = time.process_time()
     driver = TrialDriver(trial, protocol.trial)
     overlap = driver.grasp_overlap()

@@ -1,4 +1,4 @@
-"""Evaluation of a folder of objects: workers plan on all views, keep the grasps as files, and try them."""
+"""Evaluation of a folder of objects: plans grasps on all views, saves them, and tries them in simulation."""
 
 import contextlib
 import dataclasses
@@ -32,18 +32,18 @@ def evaluate(
     folder: Path | None = None,
     workers: Annotated[int, Range(0, 1024)] = 0,
 ) -> Generator[ViewScore, None, None]:
-    """Plan on every view of a folder of objects, and yield each view's score.
+    """Plan grasps on every view of a folder of objects, try them in simulation, and yield the score of each view.
 
-    Only the simulator knows the true mesh. An object with bad files or a bad entry is refused.
+    Only the simulator uses the true mesh. An object with bad files or a bad entry gets a score with a refusal.
 
     Args:
         objects: a folder as in `torchgrasp.data`.
         hand: the hand that grasps.
         protocol: a protocol or its name in `PROTOCOLS`.
         spec: views and grasps; None: `EvaluationSpec()`.
-        folder: for the executable grasps of each view, OBJECT/VIEW.safetensors; None: a temporary folder. No other
-            run may write to it at the same time.
-        workers: processes (`run_tasks`); the scores do not depend on their number.
+        folder: folder for the executable grasps of each view, OBJECT/VIEW.safetensors; None: a temporary folder. No
+            other run may write to it at the same time.
+        workers: number of worker processes; the scores do not depend on it.
 
     Raises:
         BadArgument: an unknown protocol, or no objects.
@@ -80,7 +80,7 @@ def _evaluate(
     folder: Path | None,
     workers: int,
 ) -> Generator[ViewScore, None, None]:
-    """Yield the scores, lazily; `evaluate` checks at once."""
+    """Yield the scores of all views; `evaluate` has checked the arguments."""
     yield from refused
     with _shelf(folder, spec.planned) as shelf:
         views = [dataclasses.replace(view, shelf=shelf) for view in views]
@@ -101,7 +101,7 @@ def _evaluate(
 
 @contextlib.contextmanager
 def _shelf(folder: Path | None, planned: bool) -> Iterator[Path]:
-    """Hold the folder of grasps; the grasps of an earlier call are only read."""
+    """Lock the folder of grasps, unless grasps of an earlier call are only read; None: make a temporary folder."""
     if folder is None:
         with temporary_folder() as temporary:
             yield temporary
@@ -114,7 +114,7 @@ def _shelf(folder: Path | None, planned: bool) -> Iterator[Path]:
 
 @dataclasses.dataclass(frozen=True)
 class _View(View):
-    """A view and the folder of grasps."""
+    """A view of an object, and the folder for its grasps."""
 
     shelf: Path = Path()
 
@@ -124,7 +124,7 @@ class _View(View):
 
 
 def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
-    """Plan on a view and keep the grasps, or count the grasps of an earlier call."""
+    """Plan grasps on a view and save them, or count the grasps of an earlier call."""
     found = plan_view(view, friction, spec, view.file if spec.planned else None)
     if found.grasps is not None and not spec.planned:
         meta = found.grasps.meta | {REFUSAL: found.score.refusal.name}
@@ -133,5 +133,5 @@ def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
 
 
 def _try(view: _View, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
-    """Try one of the kept grasps."""
+    """Try one of the saved grasps of a view."""
     return try_grasp(view, load_grasps(view.file)[row], protocol, spec, (row, draw))

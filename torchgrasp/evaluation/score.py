@@ -1,4 +1,4 @@
-"""Sums over attempts: shares, failures by stage, forces, times, and the calibration of predicted success."""
+"""Summary of an evaluation: success rates, failures by stage, forces, times, calibration of predicted success."""
 
 import dataclasses
 import math
@@ -35,7 +35,7 @@ STAGES: dict[str, tuple[Status, ...]] = {
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of one grasp, at a `rank`, under one `draw` of pose errors; NaN: not measured.
+    """The outcome of one trial: the grasp of a `rank`, under pose error number `draw`; NaN: not measured.
 
     Args:
         moved: motion of the object [m]; in a lift relative to the hand.
@@ -44,7 +44,7 @@ class ProtocolResult(Value):
         overlap: overlap of hand and object at the grasp [m].
         seconds: CPU time.
         slip: motion of the object in the closed hand [m], in a lift.
-        slip_angle: its rotation [rad].
+        slip_angle: rotation of the object in the closed hand [rad], in a lift.
         predicted: predicted success of the grasp.
     """
 
@@ -65,14 +65,14 @@ class ProtocolResult(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ViewScore(Value):
-    """The outcome of a view.
+    """The outcome of one view: planning, and the trials of its grasps.
 
     Args:
         executable: number of executable grasps.
         seconds: CPU time of planning.
         attempts: results of the grasps that were tried.
-        refusal: the most frequent failure where no grasp is executable.
-        note: details of the failure.
+        refusal: the most frequent failure if no grasp is executable.
+        note: details of the refusal.
         family: family of the object (`torchgrasp.data`), or "".
         group: group of the object, or "".
         fingers: the grasping fingers.
@@ -91,22 +91,20 @@ class ViewScore(Value):
 
     @property
     def unit(self) -> str:
-        """Return the unit that intervals resample: the family, or the object if it has none."""
+        """The unit that the bootstrap resamples: the object's family, or the object if it has none."""
         return self.family or self.object
 
 
 @checked
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the numbers of an evaluation by name; intervals are over families.
+    """Return the numbers of an evaluation by name; intervals are over families of objects.
 
-    * "gsr": share of attempts that passed.
-    * "top1": share of best-ranked grasps that passed; a view without grasps fails in every draw.
-    * "objects": share of objects with a success. "refused": number of views without a grasp.
-    * "by_object", "by_group": the same numbers of parts.
-    * "failures": counts of statuses by stage. "fingers": counts of views by the grasping fingers.
-    * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
-    * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
-    * "success": calibration of the predictions (`judge`), or None.
+    * "gsr": grasp success rate, the fraction of trials that passed. * "top1": fraction of best-ranked grasps that
+    passed; a view without grasps counts as failed. * "objects": fraction of objects with a success. "refused": number
+    of views without a grasp. * "by_object", "by_group": the same numbers for each object or group. * "failures": counts
+    of statuses by stage. "fingers": counts of views by the grasping fingers. * "force_n", "overlap_mm", "plan_cpu_s",
+    "trial_cpu_s": means. "cpu_s": total. * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps. *
+    "success": calibration of the predictions (`judge`), or None.
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)
@@ -141,7 +139,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
 
 
 def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
-    """Return shares and counts of some views."""
+    """Return success rates and counts of some views."""
     draws = 1 + max((attempt.draw for score in scores for attempt in score.attempts), default=0)
     tried = [(score.unit, attempt) for score in scores for attempt in score.attempts]
     best = [(unit, attempt.passed) for unit, attempt in tried if attempt.rank == 0]
@@ -167,7 +165,7 @@ def _judge_predictions(scores: Sequence[ViewScore]) -> dict[str, Any] | None:
 
 
 def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
-    """Return the median and the 95 % quantile of the known values, or None."""
+    """Return the median and the 95 % quantile of the values that are not NaN, or None."""
     known = torch.tensor([value for value in values if not math.isnan(value)], dtype=torch.float64)
     if not len(known):
         return None
@@ -176,13 +174,13 @@ def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
 
 
 def _mean(values: Iterable[float]) -> float | None:
-    """Return the mean of the known values, or None."""
+    """Return the mean of the values that are not NaN, or None."""
     known = [value for value in values if not math.isnan(value)]
     return sum(known) / len(known) if known else None
 
 
 class Bin(NamedTuple):
-    """Predictions in [low, high): their mean, and the share of their trials that passed."""
+    """A calibration bin: predictions in [low, high), their mean, and the success rate of their trials."""
 
     low: float
     high: float
@@ -193,10 +191,11 @@ class Bin(NamedTuple):
 def judge(
     predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]
 ) -> dict[str, float | list[Bin]]:
-    """Return how well predicted probabilities agree with outcomes; `units` are resampled for the intervals of the bins.
+    """Return calibration measures of predicted probabilities, given the outcomes; intervals resample `units`.
 
     "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect predictions and 0
-    for the base rate. "auc" is the area under the ROC curve. "error" is the expected calibration error over the "bins".
+    for always predicting the mean. "auc" is the area under the ROC curve. "error" is the expected calibration error
+    over the "bins".
     """
     outcome = passed.to(predicted)
     brier, rate, bins = float((predicted - outcome).square().mean()), outcome.mean(), _bins(predicted, passed, units)
@@ -213,7 +212,7 @@ def judge(
 
 
 def _bins(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]) -> list[Bin]:
-    """Return ten bins of equal width, without the empty ones."""
+    """Return the non-empty of ten calibration bins of equal width."""
     at, bins = (predicted * 10).long().clamp(0, 9), []
     for k in at.unique().tolist():
         rows: list[int] = torch.nonzero(at == k)[:, 0].tolist()
@@ -223,7 +222,7 @@ def _bins(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Seque
 
 
 def _area_under_curve(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"]) -> float:
-    """Return how often a passed trial had a higher prediction than a failed trial; ties count half."""
+    """Return the area under the ROC curve: how often a passed trial had a higher prediction than a failed one."""
     good, bad = predicted[passed], predicted[~passed].sort().values
     if not len(good) or not len(bad):
         return math.nan
@@ -236,11 +235,11 @@ def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
     """Return whether the finger with the most certain contact touched first, as Sec. 5 expects of Eq. (27).
 
     Args:
-        contact_order: fingers by their first touch (`ClosureResult`).
-        grasp: one row; of equally certain fingers any may be first.
+        contact_order: fingers in the order of their first touch (`ClosureResult`).
+        grasp: a single grasp; of equally certain fingers any may be first.
 
     Raises:
-        BadArgument: not exactly one row, or contacts without `std_m`.
+        BadArgument: not exactly one grasp, or contacts without `std_m`.
     """
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")

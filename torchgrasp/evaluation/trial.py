@@ -1,4 +1,4 @@
-"""The driver of trials: a fresh scene, the approach, the closing and the pressing."""
+"""The driver of simulated trials: opens a fresh scene, approaches, closes and presses."""
 
 import dataclasses
 import math
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """A grasp and the true object, as in `close_hand`."""
+    """The input of a trial: a grasp and the true object; fields as the arguments of `close_hand`."""
 
     hand: Hand
     grasp: Grasps
@@ -52,12 +52,11 @@ class GraspTrial:
 
 
 class TrialDriver:
-    """A trial that is checked once and run any number of times.
+    """A trial that is checked once and can run any number of times.
 
-    Attributes:
-        reference: the closing of the hand; by default derived from the trial's hand and grasp.
-        obj_from_world: the simulator's frame in the grasp's frame; with a table it is upright on the table.
-            Poses in the simulator's frame are rounded, so that results are bitwise invariant to rigid motion.
+    Attributes: reference: the closing plan; by default derived from the trial's hand and grasp. obj_from_world: pose of
+    the simulator's frame in the grasp's frame; with a table the frame is upright on the table. Poses in the simulator's
+    frame are rounded, so that results are bitwise invariant to rigid motion.
 
     Raises:
         BadArgument, MeshError: as in `close_hand`.
@@ -86,7 +85,7 @@ class TrialDriver:
         self.scene_spec = self._scene_spec(hand, grasp, body)
 
     def _scene_spec(self, hand: Hand, grasp: Grasps, body: Body) -> SceneSpec:
-        """Return the parameters of the scene; the hand's true pose may differ from its planned pose."""
+        """Return the parameters of the scene; the hand's true pose includes the trial's pose error."""
         spec, trial, drives = self.spec, self.trial, hand.actuators
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
@@ -115,7 +114,7 @@ class TrialDriver:
         )
 
     def _body(self, given: "Solid", parts: "Sequence[trimesh.Trimesh] | None", mass: float | None = None) -> Body:
-        """Return a body in the simulator's frame; its parts are cut in the frame of the trial."""
+        """Return a body in the simulator's frame, with its convex parts."""
         mesh, parts = read_solid(given, parts)
         if mass is None:
             mass = self.spec.mass if self.spec.density is None else self.spec.density * float(mesh.volume)
@@ -124,11 +123,11 @@ class TrialDriver:
         return Body(mesh, parts, mass)
 
     def open(self) -> "TrialRun":
-        """Return a run in a fresh scene; raises `MissingExtra` without the simulator."""
+        """Return a run of the trial in a fresh scene; raises `MissingExtra` if the simulator is not installed."""
         return TrialRun(self)
 
     def grasp_overlap(self) -> float:
-        """Return the overlap [m] of hand and object at the grasp."""
+        """Return the penetration depth [m] of the hand into the object at the planned grasp."""
         joints = _by_name(self.reference.hand, self.reference.joints)
         alone = {"approach": (0.0, 0.0, 0.0), "table": False, "neighbours": (), "self_pairs": ()}
         scene_spec = dataclasses.replace(self.scene_spec, joints=joints, **alone)
@@ -136,7 +135,7 @@ class TrialDriver:
 
 
 def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingReference:
-    """Return the closing of a trial's hand; closing "paper" takes its forces from the stability model [6], if any."""
+    """Return the closing plan of a trial; for closing "paper" the stability model [6], if any, gives the forces."""
     stability = None
     if spec.closing == "paper":
         from torchgrasp.control.paper.stability import load_stability
@@ -147,7 +146,7 @@ def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingRefer
 
 
 class TrialRun:
-    """One run of a trial in a fresh scene; its phases yield after every control tick."""
+    """One run of a trial in a fresh scene; its phases are iterators that yield after every control tick."""
 
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial
@@ -162,11 +161,11 @@ class TrialRun:
 
     @property
     def starts(self) -> bool:
-        """Whether the overlap at the start is within the trial's limit."""
+        """Whether the initial penetration of the hand is within the trial's limit."""
         return self.overlap <= self.spec.overlap
 
     def approach(self) -> Iterator[None]:
-        """Bring the opened hand straight to its pre-grasp, guarded or in one sweep."""
+        """Move the opened hand straight to its pre-grasp, with contact stops or in one motion."""
         speed = 0.2  # mean speed [m/s] of an unguarded approach
         if self.controller.approaching:
             self.observation = self.robot.tick(self.controller.targets)
@@ -185,7 +184,7 @@ class TrialRun:
             yield
 
     def close(self) -> Iterator[None]:
-        """Close the fingers and press until the closing ends."""
+        """Close the fingers and press until the closing has ended."""
         self.observation = self.robot.tick(self.controller.targets)
         yield
         while not self.controller.closed:
@@ -193,7 +192,7 @@ class TrialRun:
             yield
 
     def step(self) -> None:
-        """Let the controller act for one control tick."""
+        """Run the controller and the simulation for one control tick."""
         left = self.controller.targets.left
         targets = self.controller.step(self.observation, self.robot.period)
         if left > 0.0:
@@ -202,26 +201,26 @@ class TrialRun:
 
     @property
     def felt(self) -> tuple[float, float]:
-        """Estimated friction and load [N]; NaN without the holding "grip"."""
+        """The controller's estimates of friction and load [N]; NaN without the holding "grip"."""
         hold = self.controller.hold
         return (hold.friction.mean, hold.weight) if isinstance(hold, GripHold) else (math.nan, math.nan)
 
     def strained(self) -> bool:
-        """Return whether a drive is at its torque limit."""
+        """Return whether a joint's drive is at its torque limit."""
         reference = self.robot.reference
         effort = torch.tensor([reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names])
         return bool((reference.kp * (self.controller.targets.joints - self.observation.joints).abs() >= effort).any())
 
 
 def smooth_step(time: float) -> tuple[float, float]:
-    """Return position and speed of a smooth motion from 0 to 1."""
+    """Return position and speed of a smooth motion from 0 to 1, at a time in [0, 1]."""
     return time * time * (3 - 2 * time), 6 * time * (1 - time)
 
 
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     """Return `obj_from_world`: the table at z = 0, the hand above the origin, x along the hand's x axis.
 
-    Where the hand's x axis is steeper than 60 degrees, x is along its y axis.
+    If the hand's x axis is steeper than 60 degrees, x is along its y axis.
     """
     z, origin = unit(table.normal.double()), obj_from_hand[:3, 3]
     level = [axis - (axis @ z) * z for axis in obj_from_hand[:3, :2].unbind(-1)]
@@ -230,7 +229,7 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
 
 
 def _to_world(grasp: Grasps, obj_from_world: Float[Tensor, "4 4"]) -> Grasps:
-    """Return a grasp in the simulator's frame, its lengths rounded to `GRID`."""
+    """Return a grasp in the simulator's frame, with rounded numbers."""
     world_from_obj = inverse(obj_from_world)
 
     def turn(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
@@ -246,12 +245,12 @@ def _to_world(grasp: Grasps, obj_from_world: Float[Tensor, "4 4"]) -> Grasps:
 
 
 def _rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round numbers of about 1 to a billionth."""
+    """Round numbers of about size 1 to a billionth."""
     return torch.round(numbers / GRID**1.5) * GRID**1.5
 
 
 def _moved(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
-    """Return a mesh in the simulator's frame, its vertices rounded to `GRID`."""
+    """Return a mesh in the simulator's frame, with vertices rounded to `GRID`."""
     import trimesh
 
     vertices = to_upright(torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)), obj_from_world)
@@ -259,5 +258,5 @@ def _moved(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "tr
 
 
 def _by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:
-    """Return all joints of the URDF [rad] by name."""
+    """Return the positions of all URDF joints [rad] by name, given the actuated joints."""
     return {name: float(q) for name, q in hand.expand(joints).items()}

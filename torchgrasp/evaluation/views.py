@@ -1,4 +1,4 @@
-"""One view of a folder of objects: grasps are planned on it and tried under a protocol on the true mesh."""
+"""One view of a dataset object: plans grasps on it, and tries them under a protocol on the true mesh."""
 
 import dataclasses
 import functools
@@ -39,17 +39,17 @@ Ranks = Literal["best", "spread"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class EvaluationSpec(Value):
-    """Which views of a folder of objects are planned on, and which of their grasps are tried.
+    """Options of an evaluation: which views are planned on, and which of their grasps are tried.
 
     Args:
-        grasps: the most grasps of a view.
-        ranks: the best grasps, or as many spread over all ranks.
-        starts: of the contact planner.
+        grasps: largest number of grasps to try for each view.
+        ranks: "best": the best grasps; "spread": grasps spread evenly over all ranks.
+        starts: number of initial guesses of the contact planner.
         complete: plan on whole clouds with normals, as if the shape were known.
         only: names of objects; (): all objects.
-        planned: take the grasps that an earlier call left in its folder.
-        seed: of every random number.
-        views: the most views of an object; None: all views.
+        planned: use the grasps that an earlier call saved, instead of planning.
+        seed: random seed.
+        views: largest number of views of each object; None: all views.
         fingers: as in `plan_grasps`; None: the hand's own fingers.
 
     Raises:
@@ -68,7 +68,7 @@ class EvaluationSpec(Value):
 
     @property
     def tried(self) -> str:
-        """Return in words which grasps are tried.
+        """Text that says which grasps are tried.
 
         >>> EvaluationSpec(20).tried, EvaluationSpec(6, "spread").tried
         ('the 20 best of each view', 'up to 6 of each view, spread over all ranks')
@@ -79,7 +79,7 @@ class EvaluationSpec(Value):
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the ranks of the grasps that are tried."""
+    """Return the ranks of the grasps to try, at most `most`."""
     most = min(most, executable)
     if ranks == "best" or most < 2:
         return list(range(most))
@@ -88,7 +88,7 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A view and a hand by their files."""
+    """A view of a dataset object and a hand, identified by their files."""
 
     objects: Path
     object: str
@@ -97,17 +97,17 @@ class View:
 
     @property
     def score(self) -> ViewScore:
-        """The score before planning."""
+        """The score of the view before planning."""
         entry = read_entry(self.objects, self.object)
         return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
 
     def load_hand(self) -> Hand:
-        """Load the hand."""
+        """Load the hand of the view, with its fingers."""
         return load_hand(self.hand.urdf_path.parent, self.hand.option)
 
 
 class PlannedView(NamedTuple):
-    """The score of a view without attempts, its cloud and its executable grasps; None if the object was refused."""
+    """The result of planning on a view: score, cloud and executable grasps; None if the object is refused."""
 
     score: ViewScore
     cloud: PointCloud | None = None
@@ -115,10 +115,10 @@ class PlannedView(NamedTuple):
 
 
 def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path | None = None) -> PlannedView:
-    """Plan on a view, or read the grasps of an earlier call from the file `planned`.
+    """Plan grasps on a view, or read the grasps of an earlier call from the file `planned`.
 
     Raises:
-        MissingExtra, OutputError: errors that are independent of the object.
+        MissingExtra, OutputError: errors that do not depend on the object.
     """
     most_friction = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
     hand, score = view.load_hand(), view.score
@@ -151,7 +151,7 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
 
 
 def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -> tuple[ViewScore, PointCloud, Grasps]:
-    """Read the grasps that an earlier call planned on a cloud for a hand."""
+    """Read the grasps of a view that an earlier call planned with the same cloud and hand."""
     grasps = load_grasps(path)
     if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.source.sha256):
         raise BadArgument("folder", f"{path} of another cloud or hand", "grasps of this view")
@@ -163,7 +163,7 @@ def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -
 def try_grasp(
     view: View, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
 ) -> ProtocolResult:
-    """Try one grasp of a view; `at` is its rank and the number of the draw of its pose error."""
+    """Try one grasp of a view in simulation; `at` is its rank and the number of the pose error's draw."""
     hand = hand_of(grasp, view.load_hand())
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, *at)
@@ -177,12 +177,12 @@ def try_grasp(
 
 @functools.lru_cache(maxsize=2)
 def _fit_surface(objects: Path, name: str, view: str) -> SignedDistanceField:
-    """Return the estimated surface of a view, with which contacts are compared."""
+    """Return the estimated surface of a view as a distance field, to locate the object by touch."""
     return surface_field(fit_shape(read_view(objects, name, view), table=Plane.horizontal(0.0)))
 
 
 @functools.lru_cache(maxsize=2)
 def _read_solid(objects: Path, name: str) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Return mesh and convex parts of an object."""
+    """Return the mesh and convex parts of a dataset object."""
     mesh = read_object_mesh(objects, name)
     return mesh, convex_parts(mesh)

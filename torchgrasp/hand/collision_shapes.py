@@ -1,7 +1,7 @@
-"""Collision shapes of a hand's links: covering spheres, exact boxes, and the pairs of links that can meet.
+"""Collision shapes of a hand's links: covering spheres, exact boxes, and the pairs of links that can collide.
 
-Spheres serve the clearance from object and table. Each collision shape is cut into cells, with one sphere each. No
-surface with a radius of curvature above 25 mm reaches a face between the spheres. Exact boxes and spheres serve
+Spheres give the clearance from object and table: each collision shape is cut into cells, with one sphere for each cell.
+No surface with a radius of curvature above 25 mm reaches a face between the spheres. Exact boxes and spheres give
 self-collision; there a cylinder becomes a prism of twelve sides.
 """
 
@@ -30,7 +30,10 @@ ALWAYS = 0.98  # links that overlap in a larger share of the postures overlap by
 
 @dataclasses.dataclass(frozen=True)
 class CollisionSpheres(Value):
-    """Spheres [m] fixed to links. `finger`: index in grasp order, -1 palm, -2 parked; `touching`: of fingertips.
+    """Spheres [m] that cover a hand's links, each fixed to one link.
+
+    `finger` is the finger's index in grasp order, -1 for the palm, -2 for a finger that does not grasp. `touching`
+    marks the spheres of fingertips.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").collision_spheres.center.shape
@@ -45,7 +48,7 @@ class CollisionSpheres(Value):
 
 
 def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
-    """Cover every collision shape of a URDF with spheres."""
+    """Return spheres that cover every collision shape of a URDF."""
     bulge = 0.004  # how far a sphere may stand out of a shape's faces [m], other than a fingertip's
     # Edge of the cells of fingers and palm [m]; edges and corners stick farther out of the spheres of larger cells
     finger_cell, palm_cell = 0.015, 0.022
@@ -66,7 +69,7 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
 
 
 def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
-    """Return centres and radius of the spheres that cover a shape."""
+    """Return the centres and the radius of spheres that cover a shape, on cells of about the size `cell` [m]."""
     single_layer = 0.025  # a shape thinner than this [m] has one layer of cells across
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
@@ -96,7 +99,7 @@ def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float
 
 
 def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """Return the exact shapes of a URDF with the `pairs` of links to test; None: all pairs but neighbours."""
+    """Return the exact shapes of a URDF for self-collision; `pairs` of links, None: all but neighbours."""
     names = [x.name for x in urdf.links]
     tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
     if pairs is None:
@@ -124,9 +127,9 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
 
 
 def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
-    """Return the boxes or the sphere of a shape: rotation, centre, half sizes, radius.
+    """Return the boxes or the sphere of a shape, each as rotation, centre, half sizes and radius.
 
-    The prism of a cylinder is the union of six boxes, each of which reaches from one side to the opposite side.
+    A cylinder becomes a prism, the union of six boxes that each reach from one side to the opposite side.
     """
     rotation = rotation_from_rpy(shape.rpy)
     if shape.kind == "sphere":
@@ -142,13 +145,13 @@ def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, flo
 
 
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
-    """Return the pairs of links that meet in some of n random postures, but not in nearly all, without neighbours.
+    """Return the pairs of links that collide in some of n random postures, but not in nearly all of them.
 
-    Every joint is uniform within its limits, so that the pairs serve all finger options.
+    Every joint is uniform within its limits, so that the pairs suit all finger options. Neighbours are left out.
 
     Raises:
         BadArgument: n outside [1, 10^7]; a coupling with joints that the URDF lacks.
-        HandFileError: too many shapes so near each other that the test would take too long.
+        HandFileError: so many shapes close together that the test would take too long.
     """
     check_whole("n", n, 1, 10**7)
     tree, shapes = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
@@ -180,7 +183,7 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
 
 
 def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int) -> None:
-    """Refuse shapes with too many separations to measure, if the postures ahead are like those of `frames`."""
+    """Raise `HandFileError` if too many separations must be measured; `ahead` postures are like those of `frames`."""
     left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
     if left > most:
         found = f"{len(shapes.pairs)} pairs of shapes so near each other that {left} separations must be measured"
@@ -188,7 +191,7 @@ def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l 
 
 
 def draw_postures(urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int) -> Float[Tensor, "j n"]:
-    """Draw every movable joint uniformly within its limits; coupled joints follow."""
+    """Draw random positions of all movable joints (j, n), uniform within the limits; coupled joints follow."""
     movable = {j.name: j for j in urdf.movable}
     unknown = sorted(({*coupling} | {mimic.source for mimic in coupling.values()}) - set(movable))
     if unknown:

@@ -1,4 +1,4 @@
-"""The fingers of a hand: the actuated joints with the joints that follow them, and the fingertips with their pads."""
+"""The grasping fingers of a hand: actuated joints with the joints coupled to them, and fingertips with their pads."""
 
 import dataclasses
 import functools
@@ -22,7 +22,9 @@ ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
 
 @dataclasses.dataclass(frozen=True)
 class ActuatedJoints(Value):
-    """Joints [rad or m] that move the grasping fingers. The URDF's movable joints are `coupling @ joints + offset`.
+    """The joints [rad or m] that move the grasping fingers, and the coupling of all joints to them.
+
+    All movable joints of the URDF are at `coupling @ joints + offset`.
 
     >>> from torchgrasp import load_hand
     >>> actuated = load_hand("barrett").actuated
@@ -40,18 +42,18 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Check the joints and return every movable joint of the URDF."""
+        """Check the actuated joints, and return the positions of all movable joints of the URDF."""
         self.check(joints)
         return self.couple(joints)
 
     @checked(gradients=True)
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
-        """Return every movable joint of the URDF without a check, for which the host would wait for a GPU."""
+        """Return the positions of all movable joints of the URDF, without a check, which would wait for a GPU."""
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
     @checked(gradients=True)
     def check(self, joints: Tensor, name: str = "joints") -> None:
-        """Refuse joints of a wrong count, dtype or device, NaN and infinity."""
+        """Raise `BadArgument` for joints of a wrong count, dtype or device, for NaN and for infinity."""
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
             raise BadArgument(
                 name, f"shape {tuple(joints.shape)}", f"{len(self.names)} joints in the last axis: {self.names}"
@@ -63,13 +65,13 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
-        """Refuse what `check` refuses, and joints beyond their limits by more than rounding to float32."""
+        """Raise `BadArgument` as `check`, and for joints beyond their limits by more than float32 rounding."""
         self.check(joints, name)
         low, high = self.lower.to(joints) - 1e-6, self.upper.to(joints) + 1e-6
         self._refuse(name, joints, (joints < low) | (joints > high), None)
 
     def _refuse(self, name: str, joints: Tensor, wrong: Tensor, allowed: str | None) -> None:
-        """Raise `BadArgument` with the first wrong joint; `allowed` is by default the range of the joint."""
+        """Raise `BadArgument` for the first joint marked as `wrong`; `allowed` None: the joint's range."""
         if bool(wrong.any()):
             *batch, k = torch.nonzero(wrong)[0].tolist()
             limits = f"a number in [{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"
@@ -77,9 +79,9 @@ class ActuatedJoints(Value):
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the joints of the grasping fingers; refuse joints without a range, and joints without a role.
+    """Return the actuated joints of the grasping fingers; raise `HandFileError` for joints without a range.
 
-    A joint of another finger is among them if a joint of a grasping finger follows it.
+    A joint of another finger is included if a joint of a grasping finger is coupled to it.
     """
     movable = {j.name: j for j in urdf.movable}
     own = [j for f in spec.fingers for j in f.joints]
@@ -107,10 +109,11 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips(Value):
-    """Names and links of the fingers in grasp order, with the `Pad` of each in the link's frame.
+    """The fingertips in grasp order: names, links, and the contact pad of each in its link's frame.
 
-    `index` locates the links in the whole tree. Each tip is fixed to a carrier, the last link that a joint moves.
-    `chains` is the part of the tree that leads to the carriers, and `carrier` locates them in it.
+    `index` is the index of each tip's link in the whole kinematic tree. Each tip is rigidly attached to a carrier, the
+    last link that a joint moves. `chains` is the part of the tree that leads to the carriers, and `carrier` their index
+    in it.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")
@@ -140,14 +143,14 @@ class Fingertips(Value):
 
     @functools.cached_property
     def in_carriers(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """`contact`, `normal` and `center` in the frames of the carriers."""
+        """`contact`, `normal` and `center` of the pads in the frames of the carriers."""
         pose = self.carrier_from_tip
         contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
         return contact, map_directions(pose, self.normal)[..., 0].T, center
 
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
-        """Return the frames of all links of `chains` and of the carriers."""
+        """Return the frames of all links of `chains`, and of the carriers, given all joints (j, n)."""
         if len(values) != len(self.chains.joint_names):
             raise BadArgument(
                 "values", f"{len(values)} joints", f"all {len(self.chains.joint_names)} joints of the URDF"
@@ -157,7 +160,7 @@ class Fingertips(Value):
 
 
 def tips_from_files(spec: HandSpec, urdf: Urdf) -> Fingertips:
-    """Return the fingertips of the chosen fingers."""
+    """Return the fingertips of the grasping fingers."""
     links, tips = [x.name for x in urdf.links], tuple(f.tip_link for f in spec.fingers)
     pads = zip(*(f.pad for f in spec.fingers), strict=True)
     contact, normal, center, radius = (torch.tensor(x, dtype=torch.float64) for x in pads)

@@ -1,4 +1,4 @@
-"""A robot hand as a value: joints, kinematic tree, fingertips, and how they move."""
+"""A robot hand: joints, kinematic tree, fingertips, and their kinematics."""
 
 import dataclasses
 import functools
@@ -38,7 +38,7 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """Origin of a hand: its option or the names of its fingers, its URDF, SHA-256 of both files, all options.
+    """The origin of a hand: its option or finger names, its URDF, the SHA-256 of both files, and all options.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("allegro").source.options
@@ -55,7 +55,7 @@ class HandSource(NamedTuple):
 class Hand(Value):
     """A robot hand with three to five grasping fingers, in grasp order.
 
-    Positions [m] are in the frame of the palm, the URDF's root. `approach` points out of the palm.
+    Positions [m] are in the palm's frame, the root link of the URDF. `approach` is the direction out of the palm.
 
     `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
     `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
@@ -84,12 +84,12 @@ class Hand(Value):
 
     @property
     def urdf_path(self) -> Path:
-        """The URDF."""
+        """Path of the hand's URDF."""
         return self.source.urdf_path
 
     @functools.cached_property
     def chain(self) -> "Chain":
-        """The hand's tree as a chain of pytorch-kinematics, in which every movable joint is free.
+        """The hand as a chain of pytorch-kinematics, in which every movable joint is independent.
 
         >>> from torchgrasp import load_hand
         >>> hand, joints = load_hand("barrett"), torch.zeros(1, 4, dtype=torch.float64)
@@ -101,14 +101,14 @@ class Hand(Value):
 
     @functools.cached_property
     def motion(self) -> FreeMotion:
-        """How links, collision spheres, tips' centres and pads move with the pose and the actuated joints."""
+        """How links, collision spheres, tip centres and pads move with the pose and the actuated joints."""
         spheres, tips = self.collision_spheres, self.tips
         points = (spheres.link_index, spheres.center, 1.0), (tips.index, tips.center, 1.0)
         return FreeMotion.of(self.tree, self.actuated.coupling, [*points, (tips.index, tips.normal, 0.0)])
 
     @functools.cached_property
     def derived(self) -> dict[Any, Any]:
-        """Values that later stages derive from the hand, kept as long as the hand."""
+        """A cache of values that other modules derive from the hand."""
         return {}
 
     @property
@@ -123,7 +123,7 @@ class Hand(Value):
 
     @property
     def tip_radius(self) -> Float[Tensor, "f"]:
-        """Radii of the fingertips [m]; 0: a flat or pointed tip."""
+        """Radii of the fingertips [m]; 0 for a flat or pointed tip."""
         return self.tips.radius
 
     @property
@@ -143,13 +143,13 @@ class Hand(Value):
 
     @checked
     def require_three(self, argument: str, what: str) -> None:
-        """Raise `BadArgument` for an argument if the hand has another number of fingertips than the paper's three."""
+        """Raise `BadArgument` unless the hand has three fingertips, as in the paper; `argument` is the one to blame."""
         if len(self.tips) != 3:
             raise BadArgument(argument, f"{what} for {len(self.tips)} fingertips", "three fingertips, as in the paper")
 
     @checked(gradients=True)
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
-        """Return `joints` if they are within the limits; raise `BadArgument` with the first other joint.
+        """Return `joints` if all are within their limits; otherwise raise `BadArgument` for the first that is not.
 
         >>> from torchgrasp import load_hand
         >>> hand = load_hand("barrett")
@@ -163,31 +163,31 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
-        """Return the positions of all movable joints of the URDF by name, from those of the actuated joints."""
+        """Return the positions of all movable joints of the URDF by name, given the actuated joints."""
         return dict(zip(self.tree.joint_names, self.expand_joints(joints).unbind(-1), strict=True))
 
     @checked(gradients=True)
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return the positions of all movable joints, in the order of `tree.joint_names`, from the actuated ones."""
+        """Return the positions of all movable joints, in the order of `tree.joint_names`, given the actuated joints."""
         return self.actuated.expand(joints)
 
     @checked(gradients=True)
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
-        """Return `hand_from_link` of every link, as in `tree.link_names`."""
+        """Return the pose `hand_from_link` of every link, in the order of `tree.link_names`."""
         values = self.expand_joints(joints)
         poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
 
     @checked(gradients=True)
     def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return the pads' contact points [m] and outward unit normals."""
+        """Return the contact points [m] and outward unit normals of the fingertip pads."""
         _, carriers = self.tips.frames(self._columns(joints))
         contact, normal, _ = self.tips.in_carriers
         return _rows(map_points(carriers, contact), joints), _rows(map_directions(carriers, normal), joints)
 
     @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
-        """Return the centres [m] of the tips' spheres; the contact points where the radius is 0."""
+        """Return the centres [m] of the fingertip spheres; for tips of radius 0 the contact points."""
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
 
@@ -195,9 +195,9 @@ class Hand(Value):
     def jacobian(
         self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
-        """Return the derivative [m/rad] of the contact points (finger, coordinate) by the actuated joints.
+        """Return the Jacobian [m/rad] of the fingertips' contact points by the actuated joints.
 
-        `at` are points [m] that the fingertips carry, such as where round tips touch; None: the pads' contact points.
+        `at` are points [m] fixed to the fingertips, such as where round tips touch; None: the pads' contact points.
         """
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
@@ -221,7 +221,7 @@ class Hand(Value):
 
     @checked(gradients=True)
     def sphere_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
-        """Return the centres [m] of `collision_spheres`."""
+        """Return the centres [m] of the `collision_spheres`."""
         spheres, frames = self.collision_spheres, self.tree.frames(self._columns(joints))
         return _rows(map_points(frames.index_select(2, spheres.link_index), spheres.center), joints)
 
@@ -232,15 +232,15 @@ class Hand(Value):
         below: Annotated[float, Range(-math.inf, math.inf)] = math.inf,
         chunk: Count = 1000,
     ) -> Float[Tensor, "*b"]:
-        """Return the signed least separation [m] of the pairs of links that hand.toml lists; negative: they overlap.
+        """Return the least signed separation [m] of the link pairs that hand.toml lists; negative: links overlap.
 
-        An overlap is the least translation that parts two links. Apart, the value is a lower bound of the distance,
-        exact where a face is nearest.
+        A negative value is minus the shortest translation that separates two links. A positive value is a lower bound
+        of the distance, exact where a face is nearest.
 
         Args:
-            joints: (.., h).
-            below: separations above it [m] may be replaced by other lower bounds, which is faster.
-            chunk: postures that are computed at a time; it bounds the memory.
+            joints: actuated joints (.., h).
+            below: separations above this value [m] may be inexact lower bounds, which is faster.
+            chunk: number of postures computed at a time, which bounds the memory.
         """
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])
@@ -254,11 +254,11 @@ class Hand(Value):
         return tuple((names[one], names[two]) for one, two in self.self_collision.link_pairs())
 
     def _columns(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "j n"]:
-        """Return every movable joint of the URDF, with the postures last."""
+        """Return all movable joints of the URDF as columns (j, n), one posture in each column."""
         values = self.expand_joints(joints)
         return values.reshape(-1, values.shape[-1]).T.contiguous()
 
 
 def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
-    """Reverse the axes of a tensor with the postures last; restore the batch shape of `joints`."""
+    """Return a tensor with postures in the last axis with its axes reversed, and with the batch shape of `joints`."""
     return columns.permute(*range(columns.ndim - 1, -1, -1)).reshape(*joints.shape[:-1], *columns.shape[-2::-1])

@@ -1,4 +1,4 @@
-"""Reader of hand.toml: fingers, pads, coupled and parked joints, pairs of links that can meet."""
+"""Reader of hand.toml: fingers, pads, coupled and parked joints, pairs of links that can collide."""
 
 import dataclasses
 import functools
@@ -29,7 +29,7 @@ _DOTTED = re.compile(
 
 
 class Pad(NamedTuple):
-    """The surface of a tip that touches, in its link's frame [m]: a sphere about `center`, or a point (radius 0)."""
+    """The touching surface of a fingertip, in its link's frame [m]: a sphere about `center`, or a point (radius 0)."""
 
     contact: Triple
     normal: Triple
@@ -54,7 +54,7 @@ Fingers = str | int | tuple[str, ...]
 
 
 class Option(NamedTuple):
-    """The fingers that grasp, and the positions [rad] of parked joints."""
+    """An option of hand.toml: the grasping fingers, and the positions [rad] of parked joints."""
 
     fingers: Grasping
     parked: dict[str, float]
@@ -62,7 +62,7 @@ class Option(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class HandSpec:
-    """The values of a hand.toml, with the grasping `fingers` of `option`."""
+    """The content of a hand.toml, with the grasping `fingers` of the chosen `option`."""
 
     path: Path
     name: str
@@ -82,7 +82,7 @@ class HandSpec:
     data: bytes
 
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Make the error for a broken rule."""
+        """Return the error for a broken rule of hand.toml."""
         return HandFileError("hand.toml", f"{self.path}: {found}", allowed)
 
 
@@ -173,16 +173,16 @@ def _option(field: Field, known: tuple[Finger, ...]) -> Option:
 
 
 def _is_graspable(names: tuple[str, ...], known: Collection[str]) -> bool:
-    """Return whether fingers are known, different, and of a supported number."""
+    """Return whether finger names are known, different, and of a supported number."""
     return FINGERTIPS[0] <= len(names) <= FINGERTIPS[1] and len(set(names)) == len(names) and set(names) <= set(known)
 
 
 def _choose(
     options: dict[str, Option], known: dict[str, Finger], coupling: dict[str, Mimic], wanted: Fingers
 ) -> tuple[str, Option]:
-    """Return the wanted fingers and the name of their option; for fingers without an option it is their names.
+    """Return the name and content of the option for the wanted fingers; without an option the name lists the fingers.
 
-    Joints that no option parks stay at zero, or at the limit next to zero.
+    Joints that no option parks stay at zero, or at the limit nearest to zero.
     """
     declared = f"one of the options {sorted(options)}, their number of fingers, or {SUPPORTED} of {sorted(known)}"
     if isinstance(wanted, str) and wanted in options:
@@ -201,7 +201,7 @@ def _choose(
 
 
 def _coupling(field: Field) -> dict[str, Mimic]:
-    """Read the coupled joints."""
+    """Read the coupled joints from hand.toml."""
     coupling, joints = dict[str, Mimic](), field.entries()
     for joint, row in joints.items():
         table = _entries(row, ("source", "ratio", "offset"), {})
@@ -213,7 +213,7 @@ def _coupling(field: Field) -> dict[str, Mimic]:
 
 
 def _pairs(field: Field) -> tuple[tuple[str, str], ...] | None:
-    """Read the pairs of links to test for self-collision; None if there is no list of them."""
+    """Read the pairs of links to test for self-collision from hand.toml; None: not given."""
     pairs = _entries(field, (), {"pairs": None})["pairs"]
     if pairs.value is None:
         return None

@@ -1,6 +1,7 @@
-"""Forward kinematics of the tree of a URDF, level by level, for all postures at once.
+"""Forward kinematics of a URDF's tree, level by level, for all postures at once.
 
-The child's frame in its parent is `constant + sine sin q + cosine cos q + slide q`, with four tables made once.
+The frame of a child link in its parent is `constant + sine sin q + cosine cos q + slide q`, with four tables that are
+computed once.
 """
 
 import dataclasses
@@ -22,14 +23,14 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
-    """The links and movable joints of a URDF in the order of the file, or a part of the tree.
+    """The kinematic tree of a URDF, or a part of it, as tables; links and joints are in the order of the file.
 
-    `child[j]` is the link that joint j moves, or 0 outside this part; `axis` is in the frame of that link. `prismatic`
-    is 1 for a sliding joint, and `moves[l, j]` is 1 if joint j moves link l.
+    `child[j]` is the link that joint j moves, or 0 if it is outside this part; `axis` is in that link's frame.
+    `prismatic` is 1 for a sliding joint, and `moves[l, j]` is 1 if joint j moves link l.
 
-    `tables` has the links sorted by level; `level_sizes` counts them. `joint` is the index of the joint that moves a
-    link, 0 for a fixed link. `parent` indexes the level above; in a `straight` level it is 0, 1, 2 up to the size of
-    that level. `places` has the places of `link_names` among the sorted links.
+    In `tables` the links are sorted by level; `level_sizes` counts them. `joint` is the index of the joint that moves a
+    link, 0 for a fixed link. `parent` is the index of a link's parent in the level above. In a `straight` level the
+    parents are 0, 1, 2 and so on. `places` are the indices of `link_names` among the sorted links.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -60,9 +61,9 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Float[Tensor, "3 4 l n"]:
-        """Return three rows of `root_from_link` of every link, with the postures in the last axis, which is fast.
+        """Return the upper three rows of `root_from_link` of every link; the last axis counts the postures.
 
-        With `root`, poses of the root in another frame, the poses of the links are in that frame, too.
+        With `root`, the root's poses in another frame, the link poses are in that frame too.
         """
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))
@@ -87,14 +88,14 @@ class KinematicTree(Value):
 
     @checked(gradients=True)
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-        """Return `root_from_link` of every link for joints [rad or m]."""
+        """Return the pose `root_from_link` of every link, given all movable joints [rad or m]."""
         frames = self.frames(values.T.contiguous())
         last = torch.eye(4, dtype=frames.dtype, device=frames.device)[3, :, None, None].expand(1, 4, *frames.shape[2:])
         return torch.cat([frames, last]).permute(3, 2, 0, 1)
 
     @checked(gradients=True)
     def joint_axes(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return axis and origin of every joint in the root's frame, from the links' poses."""
+        """Return the axis and a point of every joint in the root's frame, given the link poses."""
         child = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0).index_select(2, self.child)
         axes, origins = (x.permute(2, 1, 0) for x in (map_directions(child, self.axis), child[:, 3]))
         size = (*poses.shape[:-3], len(self.child), 3)
@@ -103,14 +104,14 @@ class KinematicTree(Value):
 
 @dataclasses.dataclass(frozen=True)
 class FreeMotion(Value):
-    """How the links of a hand with a free pose move, and what moves with them: tables for refinement.
+    """Tables of how the links of a free-floating hand, and marker points on them, move; for refinement.
 
-    The q motions are three translations along the root's axes, three rotations about them, and the joints that an
-    actuated joint moves. `moves[l, q]` is 1 if a motion moves link l. `coupling` gives the motions by the six numbers
-    of a step of the pose and by the actuated joints; None: it is the identity.
+    The q motions are three translations along the root's axes, three rotations about them, and the joints that the
+    actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling` maps a step of pose (six numbers) and
+    actuated joints to the motions; None: the identity.
 
-    `product` maps the markers with all frames in one product, in groups of `sizes`. The markers are the given ones,
-    then the motions' origins, axes of turns and axes of slides. Of the two axes one is zero.
+    `product` maps all link frames to all markers in one matrix product, in groups of `sizes`. The markers are the given
+    ones, then each motion's origin, rotation axis and translation axis; one of the two axes is zero.
     """
 
     product: Float[Tensor, "m k"]
@@ -125,7 +126,7 @@ class FreeMotion(Value):
         coupling: Float[Tensor, "j h"],
         markers: Sequence[tuple[Int[Tensor, "_"], Float[Tensor, "_ 3"], float]],
     ) -> "FreeMotion":
-        """Tabulate motions and groups of markers: their links, their coordinates, 1 for points or 0 for directions."""
+        """Return the tables of motions and marker groups: links, coordinates, and 1 for points or 0 for directions."""
         own = torch.nonzero((coupling != 0).any(1))[:, 0]
         axes, slides = torch.eye(3).to(tree.axis), tree.prismatic[own]
         root = torch.nonzero(tree.places == 0)[:, 0].expand(6)
@@ -143,24 +144,24 @@ class FreeMotion(Value):
         return cls(product.flatten(1), tuple(len(x) for x in local), moves, None if same else whole)
 
     def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
-        """Return the coordinates of each group of markers in the frame of `frames`."""
+        """Return the coordinates of each group of markers, given all link frames."""
         product = self.product.to(frames).expand(3, -1, -1)
         return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
 
 
 def map_points(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
-    """Map one point of each frame into the root's."""
+    """Map one point of each link frame into the root's frame."""
     return map_directions(frames, local) + frames[:, 3]
 
 
 def map_directions(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
-    """Map one direction of each frame into the root's."""
+    """Map one direction of each link frame into the root's frame."""
     x, y, z = local.to(frames)[:, :, None].unbind(1)
     return torch.addcmul(torch.addcmul(frames[:, 0] * x, frames[:, 1], y), frames[:, 2], z)
 
 
 def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> KinematicTree:
-    """Tabulate the tree of a URDF, or the part that leads to the links `ends`."""
+    """Return the kinematic tree of a URDF, or the part of it that leads to the links `ends`."""
     above = {j.child: j for j in urdf.joints}
     part = {x.name for x in urdf.links} if ends is None else {urdf.root, *ends}
     part |= {j.parent for end in ends or () for j in urdf.joints_above(end)}
@@ -190,9 +191,9 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
 
 
 def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
-    """Return the tree of a URDF as pytorch-kinematics' chain; `<mimic>` joints are free in it.
+    """Return the tree of a URDF as a chain of pytorch-kinematics; `<mimic>` joints are independent in it.
 
-    It is built from the values of the URDF, since the library's own reader rounds angles to seven digits.
+    The chain is built from our URDF values, because the reader of pytorch-kinematics rounds angles to seven digits.
     """
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Link
@@ -213,7 +214,7 @@ def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
 
 
 def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
-    """Return the carrier of a link and the link's frame in it."""
+    """Return the last link that a joint moves above a given link (its carrier), and the given link's pose in it."""
     above = {j.child: j for j in urdf.joints}
     pose = _tables(None)[0]
     while link in above and above[link].kind == "fixed":
@@ -224,7 +225,7 @@ def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
 
 
 def _tables(joint: Joint | None) -> Float[Tensor, "4 3 4"]:
-    """Return the tables of a joint; None: the identity of the root."""
+    """Return the four tables of a joint's pose in its parent; None: those of the root."""
     tables = torch.zeros(4, 3, 4, dtype=torch.float64)
     constant, sine, cosine, slide = tables
     if joint is None:

@@ -1,4 +1,4 @@
-"""Loading of a hand from its folder, with checks that hand.toml and URDF fit each other."""
+"""Loading of a hand from its folder; checks that hand.toml and URDF agree."""
 
 import hashlib
 from pathlib import Path
@@ -17,7 +17,7 @@ from torchgrasp.values import Grasps
 
 
 def hands_folder() -> Path:
-    """Return the folder of the shipped hands: in the package, or beside it in a checkout.
+    """Return the folder of the shipped hands: inside the package, or beside it in a source checkout.
 
     >>> (hands_folder() / "allegro" / "hand.toml").is_file()
     True
@@ -29,10 +29,10 @@ def hands_folder() -> Path:
 
 @checked
 def find_hand(name_or_path: str | Path) -> Path:
-    """Return the folder of a hand, given a shipped name, a folder or a hand.toml.
+    """Return the folder of a hand, given a shipped hand's name, a folder or a hand.toml.
 
     Raises:
-        HandFileError: no such hand, or a shipped name that is also a folder here.
+        HandFileError: no such hand, or a shipped name that is also a folder in the working directory.
 
     >>> find_hand("allegro").name
     'allegro'
@@ -54,14 +54,14 @@ def find_hand(name_or_path: str | Path) -> Path:
 
 @checked
 def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
-    """Load a hand from its hand.toml and URDF, with the fingers that grasp.
+    """Load a hand from its hand.toml and URDF, with the chosen grasping fingers.
 
     Args:
         name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the folder of another hand.
-        fingers: an option of hand.toml: "default", or for the Allegro "four" (all) or "paper_literal" (index, middle
-            and ring). Or a number, for the first option with so many fingers. Or names of three to five fingers, in
-            grasp order. Joints of the other fingers are parked where an option parks them, else at zero or the limit
-            next to zero.
+        fingers: the grasping fingers, as an option of hand.toml: "default", or for the Allegro "four" (all) or
+            "paper_literal" (index, middle and ring); or as a number, for the first option with so many fingers; or as
+            the names of three to five fingers in grasp order. Joints of other fingers are parked where an option parks
+            them, else at zero or the limit nearest to zero.
 
     Raises:
         HandFileError: a file is missing or malformed, or the two files do not fit each other.
@@ -89,7 +89,7 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 @checked
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
-    """Return the same hand, on its device, grasping with other fingers; see `load_hand`.
+    """Return the same hand, on the same device, with other grasping fingers; see `load_hand`.
 
     >>> with_fingers(load_hand("allegro"), 4).finger_names
     ('index', 'middle', 'ring', 'thumb')
@@ -103,7 +103,7 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     """Return the hand with the fingers for which grasps were planned.
 
     Args:
-        grasps: of `plan_grasps`, or a file of them.
+        grasps: grasps of `plan_grasps`, also loaded from a file.
         hand: the same hand with any fingers, its name or its folder; None: the shipped hand that the grasps name.
 
     Raises:
@@ -126,12 +126,12 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
 
 
 def _digest(spec: HandSpec, urdf: Urdf) -> str:
-    """Return the SHA-256 of both files."""
+    """Return the SHA-256 of hand.toml and URDF together."""
     return hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()
 
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse names in hand.toml that the URDF lacks, and parked joints that grasp, lead or follow."""
+    """Raise `HandFileError` for names that the URDF lacks, and for parked joints that grasp, lead or follow."""
     movable, links = {j.name for j in urdf.movable}, {x.name for x in urdf.links}
     if spec.base_link != urdf.root:
         raise spec.wrong(f"base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r} as base_link")
@@ -149,7 +149,7 @@ def _check_names(spec: HandSpec, urdf: Urdf) -> None:
 
 
 def _check_mimics_and_shapes(spec: HandSpec, urdf: Urdf) -> None:
-    """Refuse mimic joints that hand.toml contradicts, a fingertip without a shape, and hands of fingertips alone."""
+    """Raise `HandFileError` for contradicted mimic joints, tips without shapes, and hands of only fingertips."""
     for joint in urdf.joints:
         if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:
             found = f"joint {joint.name} follows {spec.coupling.get(joint.name, 'nothing')}"

@@ -1,6 +1,7 @@
-"""The gate in front of every reader of a URDF: bounded XML, without declarations, of known words and finite numbers.
+"""The safety gate for URDF files: bounded XML without declarations, known elements and finite numbers only.
 
-The gate writes the XML anew from the elements below, so that no reader sees anything else. It opens no other file.
+The gate writes the XML anew from the elements listed below, so that other readers see nothing else. It opens no other
+file.
 """
 
 import math
@@ -49,7 +50,7 @@ NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
 
 
 class _BoundedBuilder(ET.TreeBuilder):
-    """A tree builder that refuses too many elements and too deep nesting."""
+    """An XML tree builder that rejects too many elements and too deep nesting."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,7 +69,7 @@ class _BoundedBuilder(ET.TreeBuilder):
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Parse the bytes of a URDF; return links and joints alone, with each number checked. Raises `HandFileError`."""
+    """Parse the bytes of a URDF; return only its links and joints, with checked numbers. Raises `HandFileError`."""
     # also within comments: a declaration may be hidden by a processing instruction that looks like a comment
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "a URDF without declarations")
@@ -96,7 +97,7 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
 
 
 def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
-    """Copy the known parts of an element; refuse a missing part, and words that are not numbers."""
+    """Return a copy of an element with its known parts; raise `HandFileError` for missing parts or bad numbers."""
     tag = str(element.tag)
     clean = ET.Element(tag)
     where = "" if tag == "robot" else f"{where} {tag} {(element.get('name') or '')[:XML_LETTERS]}".strip()

@@ -1,4 +1,4 @@
-"""Exact signed separations of a hand's links, by their collision shapes: boxes and spheres."""
+"""Exact signed separations between the links of a hand, whose shapes are boxes and spheres."""
 
 import dataclasses
 import itertools
@@ -25,9 +25,9 @@ Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "
 
 @dataclasses.dataclass(frozen=True)
 class SelfCollision(Value):
-    """Boxes (`radius` 0) and spheres (`half` sizes 0) fixed to links, in link frames [m], and the pairs to test.
+    """Boxes (`radius` 0) and spheres (`half` sizes 0) fixed to links [m], and the pairs of shapes to test.
 
-    `pairs` lists box and box, sphere and box, sphere and sphere; `kinds` counts each kind.
+    `pairs` lists box-box pairs, then sphere-box, then sphere-sphere; `kinds` counts each kind.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -50,7 +50,7 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def clearance(self, frames: Float[Tensor, "3 4 l n"], below: Bound = torch.inf) -> Float[Tensor, " n"]:
-        """Return the signed least separation [m]; infinite without pairs, and any larger number above `below`."""
+        """Return the least signed separation [m] of all pairs; infinite without pairs, inexact above `below`."""
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
             return least
@@ -64,7 +64,7 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
-        """Return the separation [m] of each pair; above `below`, that of the bounding spheres."""
+        """Return the signed separation [m] of each pair; above `below`, that of the bounding spheres."""
         shapes, apart, pair, row = self._near(frames, below)
         return apart.index_put((pair, row), self._separations(shapes, pair, row))
 
@@ -72,10 +72,10 @@ class SelfCollision(Value):
     def pushes(
         self, frames: Float[Tensor, "3 4 l n"], below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
-        """Return `separations`, the index of each pair's wrench, and the wrenches.
+        """Return the separations, the index of each pair's wrench, and the wrenches: derivatives of the separations.
 
         A wrench is the derivative of a separation by a twist (translation, rotation) of the second shape. The last
-        wrench is zero, for separations above `below`.
+        wrench is zero, and belongs to separations above `below`.
         """
         shapes, apart, pair, row = self._near(frames, below)
         separation, wrench = apart.new_zeros(len(pair)), apart.new_zeros(6, len(pair) + 1)
@@ -91,22 +91,22 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def count_near(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> int:
-        """Return how many pairs, over all rows, have bounding spheres nearer than `below`."""
+        """Return the number of pairs, over all postures, whose bounding spheres are nearer than `below`."""
         return len(self._near(frames, below)[2])
 
     @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
-        """Return the same shapes with some of the pairs."""
+        """Return the same shapes with only the pairs in the mask `kept`."""
         one, two, three = (int(kind.sum()) for kind in kept.split(self.kinds))
         return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 
     def link_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of links that are tested, by their indices."""
+        """Return the pairs of links that are tested, as link indices."""
         links = torch.unique(self.link[self.pairs].sort(1).values, dim=0)
         return [(int(one), int(two)) for one, two in links]
 
     def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
-        """Return the shapes' axes and centres in the palm's frame; raise `BadArgument` for frames of too few links."""
+        """Return the shapes' axes and centres in the palm's frame, given the link frames."""
         if frames.shape[2] < self._links:
             raise BadArgument("frames", f"{frames.shape[2]} links", f"at least {self._links} links")
         links, rotation = frames.index_select(2, self.link), self.rotation.to(frames)[..., None]
@@ -116,7 +116,7 @@ class SelfCollision(Value):
     def _near(
         self, frames: Float[Tensor, "3 4 l n"], below: float
     ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"]]:
-        """Return the shapes, the separations of their bounding spheres, and the pairs and rows of those below."""
+        """Return placed shapes, separations of bounding spheres, and pair and posture of separations below `below`."""
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding, distance)
@@ -124,26 +124,26 @@ class SelfCollision(Value):
         return shapes, apart, pair, row
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
-        """Return the distance between the centres of each pair."""
+        """Return the distance between the two centres of each pair."""
         first, second = self.pairs.unbind(1)
         return _length(center.index_select(1, second) - center.index_select(1, first))
 
     @cached_property
     def _links(self) -> int:
-        """Least number of links whose frames place every shape."""
+        """The least number of link frames that place every shape."""
         return int(self.link.max()) + 1 if len(self.link) else 0
 
     @cached_property
     def _bounding(self) -> Float[Tensor, " s"]:
-        """Radii of the bounding spheres."""
+        """The radii of the shapes' bounding spheres."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
 
     def _sums(self, radius: Float[Tensor, " s"], like: Tensor) -> Float[Tensor, "p 1"]:
-        """Return the sums of radii over the pairs."""
+        """Return the sum of the two radii of each pair."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
     def _split(self, pair: Int[Tensor, " k"]) -> Iterator[tuple[int, slice]]:
-        """Yield the kinds among sorted pairs, and where the pairs of each are."""
+        """Yield each kind among sorted pairs, with the slice of its pairs."""
         first, second, _ = self.kinds
         ends = torch.searchsorted(pair, torch.tensor([first, first + second], device=pair.device)).tolist()
         for kind, (low, high) in enumerate(itertools.pairwise((0, *ends, len(pair)))):
@@ -151,14 +151,14 @@ class SelfCollision(Value):
                 yield kind, slice(low, high)
 
     def _separations(self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
-        """Return the separation of chosen pairs, which are sorted, in chosen rows."""
+        """Return the separations of chosen pairs (sorted) in chosen postures."""
         parts = [self._of_kind(kind, shapes, pair[at], row[at])[0] for kind, at in self._split(pair)]
         return torch.cat(parts) if parts else shapes[1].new_zeros(0)
 
     def _of_kind(
         self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> tuple[Float[Tensor, " k"], Push]:
-        """Return the separation of pairs of one kind, and a function of the pushes of some of them."""
+        """Return the separations of pairs of one kind, and a function that returns their pushes."""
         (first, second), (one, two), place, gap = self._meet(shapes, pair, row)
         half, radius, bounding = (x.to(gap) for x in (self.half.T, self.radius, self._bounding))
         if kind == 1:
@@ -189,7 +189,7 @@ class SelfCollision(Value):
     def _meet(
         self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
-        """Return the shapes of chosen pairs, their axes, the second centres, and the gaps from the first centres."""
+        """Return, for chosen pairs: shape indices, axes, centre of the second shape, and vector between the centres."""
         rotation, center, n = shapes[0].flatten(2), shapes[1].flatten(1), shapes[1].shape[2]
         first, second = self.pairs[pair].unbind(1)
         one, two = first * n + row, second * n + row
@@ -210,9 +210,9 @@ def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
 
 
 class BoxPairs(NamedTuple):
-    """Pairs of boxes: column i of the rotations `a` and `b` is axis i, `half_a` and `half_b` [m] are half sizes.
+    """Pairs of boxes, with axes as columns of `a` and `b`, half sizes `half_a` and `half_b` [m].
 
-    `gap` [m] reaches from the first centre to the second.
+    `gap` [m] is the vector from the centre of the first box to that of the second.
     """
 
     a: Float[Tensor, "3 3 k"]
@@ -222,11 +222,11 @@ class BoxPairs(NamedTuple):
     half_b: Float[Tensor, "3 k"]
 
     def along_axes(self) -> Float[Tensor, "15 k"]:
-        """Return the separations [m] along 15 axes, the largest of which is the boxes' (Gottschalk et al., 1996).
+        """Return the separations [m] along the 15 candidate axes of two boxes (Gottschalk et al., 1996).
 
-        The axes are those of both boxes, then their cross products. Overlap is negative: the least translation that
-        parts the boxes. Apart, the value is a lower bound of the distance, exact where a face or two crossing edges are
-        nearest.
+        The axes are those of both boxes, then their cross products; the largest separation is that of the boxes. A
+        negative value is minus the shortest translation that separates the boxes. A positive value is a lower bound of
+        the distance, exact where a face or two crossing edges are nearest.
         """
         a, b, gap, half_a, half_b = self
         rotation = (a[:, :, None] * b[:, None]).sum(0)  # b's axes in the frame of a
@@ -245,7 +245,7 @@ class BoxPairs(NamedTuple):
         return torch.cat([by_a, by_b, torch.where(crossing, by_edges, -torch.inf).flatten(0, 1)])
 
     def push(self, best: Int[Tensor, " k"]) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
-        """Return the `best` axis, towards the second box, and the contact point from that box's centre [m]."""
+        """Return the axis of index `best`, towards the second box, and the contact point from that box's centre [m]."""
         a, b, gap, half_a, half_b = self
         best = best[None]
         edges, i = best >= 6, torch.where(best >= 6, (best - 6) // 3, best.clamp_max(2))
@@ -264,7 +264,7 @@ class BoxPairs(NamedTuple):
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the distance of points from boxes about the origin, negative inside."""
+    """Return the signed distance of points from boxes centred at the origin, negative inside."""
     ox, oy, oz = (points.abs() - half).unbind(-1)
     px, py, pz = ox.clamp_min(0), oy.clamp_min(0), oz.clamp_min(0)
     squared = px * px + py * py + pz * pz

@@ -1,4 +1,4 @@
-"""A URDF as values: links, joints and collision shapes of a checked tree. No mesh is opened."""
+"""A URDF as values: the checked tree of links, joints and collision shapes. Mesh files are not opened."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ Triple = tuple[float, float, float]
 
 
 class Mimic(NamedTuple):
-    """The position of a coupled joint: `ratio * source + offset`."""
+    """A coupled joint: its position is `ratio * source + offset`."""
 
     source: str
     ratio: float
@@ -35,7 +35,7 @@ class Mimic(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A collision shape, box, sphere, cylinder or mesh.
+    """A collision shape of a link: box, sphere, cylinder or mesh.
 
     `size` is (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]; the scale of a mesh.
     """
@@ -49,7 +49,7 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """A rigid body: mass [kg], centre [m], inertia (xx, xy, xz, yy, yz, zz) [kg m2] about it, shapes."""
+    """A rigid link: mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m2] about it, collision shapes."""
 
     name: str
     mass: float
@@ -60,7 +60,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint of the tree; the limits are 0 for a fixed joint, and infinite where the URDF has none."""
+    """A joint of the tree; limits are 0 for a fixed joint, and infinite if the URDF has none."""
 
     name: str
     kind: str
@@ -83,9 +83,9 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A checked URDF: one tree of links, finite numbers throughout.
+    """A checked URDF: its links form one tree, and all numbers are finite.
 
-    `data` are the bytes of the file, `xml` the bytes of its checked links and joints alone.
+    `data` holds the bytes of the file, `xml` the bytes of the checked links and joints only.
     """
 
     path: Path
@@ -98,7 +98,7 @@ class Urdf:
 
     @checked
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Make the error for a broken rule."""
+        """Return the error for a broken rule of the URDF."""
         return HandFileError("urdf", f"{self.path}: {found}", allowed)
 
     @functools.cached_property
@@ -108,7 +108,7 @@ class Urdf:
 
     @checked
     def joints_above(self, link: str) -> tuple[Joint, ...]:
-        """Return the joints from a link to the root, nearest first."""
+        """Return the joints on the way from a link to the root, nearest first."""
         above, chain = {j.child: j for j in self.joints}, []
         while link in above:
             chain.append(above[link])
@@ -117,17 +117,17 @@ class Urdf:
 
     @checked
     def movers(self, link: str) -> tuple[Joint, ...]:
-        """Return the movable joints above a link."""
+        """Return the movable joints on the way from a link to the root, nearest first."""
         return tuple(j for j in self.joints_above(link) if j.kind != "fixed")
 
 
 @checked
 def read_urdf(path: Path | str) -> Urdf:
-    """Read and check a clean URDF file.
+    """Read and check a URDF file that the library can use.
 
     Raises:
-        HandFileError: the file is missing, too large, hostile or no tree of bodies; a mesh as a collision shape; a
-            joint without limits, or one that follows a coupled joint.
+        HandFileError: the file is missing, too large, hostile or not a tree of links; a mesh as a collision shape; a
+            joint without limits, or coupled to a joint that is coupled itself.
     """
     urdf = read_published(path)
     for link in urdf.links:
@@ -142,10 +142,10 @@ def read_urdf(path: Path | str) -> Urdf:
 
 
 def read_published(path: Path | str) -> Urdf:
-    """Read a URDF as it is published: with meshes, without limits, with joints that follow coupled joints.
+    """Read a URDF as published: meshes, joints without limits and chains of coupled joints are allowed.
 
     Raises:
-        HandFileError: the file is missing, too large, hostile or no tree of bodies.
+        HandFileError: the file is missing, too large, hostile or not a tree of links.
     """
     path = Path(path)
     data = read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf"))
@@ -159,24 +159,24 @@ def read_published(path: Path | str) -> Urdf:
 
 
 def _part(element: ET.Element, tag: str) -> ET.Element:
-    """Return the first part with a tag; the gate refused an element without it."""
+    """Return the first child element with a tag, which the safety gate has made sure of."""
     return next(element.iter(tag))
 
 
 def _floats(element: ET.Element, *keys: str) -> list[float]:
-    """Read the numbers of attributes that the gate checked; adding 0.0 makes a negative zero positive."""
+    """Return the numbers of attributes that the safety gate has checked; negative zero becomes zero."""
     return [float(word) + 0.0 for key in keys for word in element.attrib[key].split()]
 
 
 def _origin(element: ET.Element) -> tuple[Triple, Triple]:
-    """Return translation [m] and fixed-axis angles [rad]; zeros without an `<origin>`."""
+    """Return translation [m] and fixed-axis angles [rad] of an element; zeros without an `<origin>`."""
     origin = element.find("origin")
     x, y, z, roll, pitch, yaw = [0.0] * 6 if origin is None else _floats(origin, "xyz", "rpy")
     return (x, y, z), (roll, pitch, yaw)
 
 
 def _link(link: ET.Element) -> Link:
-    """Read a link; its inertia is turned into the link's axes."""
+    """Read a link; its inertia is rotated into the link's axes."""
     shapes, inertial = tuple(map(_shape, link.findall("collision"))), link.find("inertial")
     if inertial is None:
         return Link(link.attrib["name"], 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
@@ -195,7 +195,7 @@ def _shape(collision: ET.Element) -> Shape:
 
 
 def _joint(joint: ET.Element) -> Joint:
-    """Read a joint. Its default axis is x, as in ROS; a continuous joint has no limits."""
+    """Read a joint. Its default axis is x, as in ROS; a continuous joint gets no limits."""
     name, kind, (xyz, rpy) = joint.attrib["name"], joint.attrib["type"], _origin(joint)
     parent, child = (_part(joint, tag).attrib["link"] for tag in ("parent", "child"))
     if kind == "fixed":
@@ -213,12 +213,11 @@ def _joint(joint: ET.Element) -> Joint:
 
 
 def _is_unit(length: float) -> bool:
-    """Return whether an axis has length 1."""
     return 0.999 < length < 1.001
 
 
 def _check_names(urdf: Urdf) -> None:
-    """Refuse too many links, names and children that occur twice, and joints of unknown links."""
+    """Raise `HandFileError` for too many links, repeated names or children, and joints of unknown links."""
     if not 0 < len(urdf.links) <= HAND_LINKS:
         raise urdf.wrong(f"{len(urdf.links)} links", f"1 to {HAND_LINKS} links")
     names = [x.name for x in urdf.links]
@@ -233,7 +232,7 @@ def _check_names(urdf: Urdf) -> None:
 
 
 def _check_shapes(urdf: Urdf) -> None:
-    """Refuse too many shapes, and sizes that are not positive or too large for a hand."""
+    """Raise `HandFileError` for too many shapes, and for sizes that are not positive or too large for a hand."""
     count = sum(len(link.shapes) for link in urdf.links)
     if count > HAND_SHAPES:
         raise urdf.wrong(f"{count} collision shapes", f"at most {HAND_SHAPES} collision shapes")
@@ -244,7 +243,7 @@ def _check_shapes(urdf: Urdf) -> None:
 
 
 def _check_joints(urdf: Urdf) -> None:
-    """Refuse unknown kinds of joints, wrong axes and limits, and coupled joints in a circle."""
+    """Raise `HandFileError` for unknown types, wrong axes or limits, and cyclic couplings of joints."""
     movable = {j.name: j for j in urdf.movable}
     for j in urdf.movable:
         if j.kind not in ("revolute", "prismatic", "continuous"):
@@ -267,7 +266,7 @@ def _check_joints(urdf: Urdf) -> None:
 
 
 def _check_tree(urdf: Urdf) -> str:
-    """Check that a tree reaches every link; return its root."""
+    """Raise `HandFileError` unless one tree reaches every link; return its root."""
     known = {x.name for x in urdf.links}
     roots = sorted(known - {j.child for j in urdf.joints})
     if len(roots) != 1:

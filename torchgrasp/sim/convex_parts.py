@@ -1,6 +1,6 @@
 """Convex parts of a mesh for the simulator, decomposed once and cached.
 
-A simulator replaces a mesh by its convex hull: a jug would be solid. CoACD cuts the mesh into convex parts.
+Simulators replace a mesh by its convex hull, which would make a jug solid. CoACD cuts the mesh into convex parts.
 """
 
 import hashlib
@@ -31,10 +31,10 @@ _log = logging.getLogger(__name__)
 
 @checked
 def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
-    """Return convex parts that fill a closed mesh, one if it is convex.
+    """Return convex parts that together fill a closed mesh; a single part if the mesh is convex.
 
-    The parts are kept in the folder `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. A folder
-    that cannot be written costs a warning.
+    The parts are cached in the folder `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. If the
+    folder cannot be written, a warning is logged.
 
     Raises:
         MeshError, SuspiciousScale: as `read_mesh`, or a mesh whose decomposition takes too much time or memory.
@@ -50,13 +50,13 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
 def read_solid(
     mesh: "trimesh.Trimesh | Path | str", parts: "Sequence[trimesh.Trimesh] | None"
 ) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Return a closed mesh (`read_mesh`) and the convex parts that make it up: the given parts, or its own."""
+    """Return a closed mesh and the convex parts that make it up; `parts` None: they are computed."""
     mesh = read_mesh(mesh)
     return mesh, _cut(mesh, None) if parts is None else check_parts(parts)
 
 
 def _cut(mesh: "trimesh.Trimesh", cache: Path | str | None) -> "list[trimesh.Trimesh]":
-    """Return convex parts of a checked mesh, from the cache or cut anew."""
+    """Return the convex parts of a checked mesh, from the cache or decomposed anew."""
     import trimesh
 
     if mesh.is_convex:
@@ -78,7 +78,7 @@ def _cut(mesh: "trimesh.Trimesh", cache: Path | str | None) -> "list[trimesh.Tri
 
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
-    """Return the convex hull of corners; rounded corners where Qhull returns an open hull."""
+    """Return the convex hull of points; the points are rounded if Qhull would return an open hull."""
     import trimesh
 
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -92,7 +92,7 @@ def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the caller's parts; refuse parts that are not convex, and too many parts."""
+    """Return the caller's convex parts; raise `MeshError` for parts that are not convex, and for too many."""
     max_parts = 1000  # most parts that a caller may give
     if len(parts) > max_parts:
         raise MeshError("parts", f"{len(parts)} parts", f"at most {max_parts}")
@@ -106,7 +106,7 @@ def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 
 
 def _fingerprint(mesh: "trimesh.Trimesh") -> str:
-    """Return the SHA-256 of the mesh and the settings of the decomposition."""
+    """Return a SHA-256 of the mesh and the settings of the decomposition, the key of the cache."""
     digest = hashlib.sha256(f"coacd 0.05 {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
@@ -114,7 +114,7 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
 
 
 def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
-    """Write the corners of all parts with their counts."""
+    """Write the corners of all parts to a cache file."""
     tensors = {
         "vertices": torch.cat([torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]),
         "counts": torch.tensor([len(p.vertices) for p in parts]),
@@ -123,7 +123,7 @@ def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
 
 
 def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
-    """Read parts that `_save` wrote, as hulls of their corners; refuse corners far outside the mesh."""
+    """Read the parts of a cache file as hulls of their corners; refuse corners far outside the mesh."""
     from scipy.spatial import QhullError
 
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})

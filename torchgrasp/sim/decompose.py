@@ -1,6 +1,6 @@
-"""CoACD in a process of its own, which is bounded in time and memory and ends with its parent.
+"""CoACD in a separate process with limits of time and memory, which ends with its parent.
 
-CoACD has no limits and delays signals. The process runs this file, which needs numpy and CoACD only.
+CoACD itself has no limits and delays signals. The process runs this file, which needs only numpy and CoACD.
 """
 
 import importlib.util
@@ -55,7 +55,7 @@ def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.
 
 
 def main(asked: dict[str, Any]) -> None:
-    """Read a mesh from stdin, decompose it within the limits, and write the parts to stdout."""
+    """Read a mesh from stdin, decompose it within the limits, and write the convex parts to stdout."""
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     _limit(asked["seconds"], asked["memory"])
     import coacd
@@ -72,14 +72,14 @@ def main(asked: dict[str, Any]) -> None:
 
 
 def _end_with_parent(parent: int) -> None:
-    """End the process when its parent has ended."""
+    """End this process once its parent process has ended."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)
 
 
 def _limit(seconds: int, memory: int) -> None:
-    """Limit processor time [s] and address space [bytes], where the system can; else the parent's clock must do."""
+    """Limit CPU time [s] and address space [bytes], if the system can; otherwise the parent's timeout applies."""
     try:
         import resource
     except ImportError:  # Windows

@@ -1,4 +1,4 @@
-"""A scene that MuJoCo simulates, and its model as MJCF."""
+"""A simulated scene in MuJoCo, and its model as MJCF."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
@@ -27,10 +27,10 @@ SOLREF, SOLIMP = "0.005 1", "0.5 0.99 0.0001"
 
 
 class MujocoScene(Scene):
-    """Table, object and hand in one MuJoCo model.
+    """A simulated scene in MuJoCo: table, object and hand.
 
-    A step runs MuJoCo's second half (forces to state) before its first (state to poses and contacts), so that poses are
-    current between steps.
+    A step runs the second half of MuJoCo's step (forces to state) before its first half (state to poses and contacts),
+    so that poses are current between steps.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
@@ -60,7 +60,7 @@ class MujocoScene(Scene):
         mujoco.mj_step1(model, data)
 
     def _map_contacts(self) -> None:
-        """Map shapes to bodies, tips and their parent bodies to fingers, and other bodies to their kind."""
+        """Map geoms to bodies, fingertips and their parent bodies to fingers, and other bodies to kinds."""
         model = self.model
         self._body_of = model.geom_bodyid.tolist()
         self._kind_of = {0: TABLETOP, self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
@@ -115,7 +115,7 @@ class MujocoScene(Scene):
         return jacobian[:, :, self._velocities]
 
     def penetration(self) -> float:
-        """Return the depth [m] of the hand in anything."""
+        """Return the largest penetration depth [m] of the hand, itself included."""
         deepest = 0.0
         for (first, second), distance in zip(self.data.contact.geom, self.data.contact.dist, strict=True):
             if self._body_of[first] not in self._kind_of or self._body_of[second] not in self._kind_of:
@@ -123,25 +123,25 @@ class MujocoScene(Scene):
         return deepest
 
     def _diverged(self) -> bool:
-        """Return whether the state has left all bounds: then every pose is NaN."""
+        """Return whether the simulation has diverged; all poses are then set to NaN."""
         if self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].any():
             self.data.qpos[:] = self.data.xpos[:] = np.nan
             return True
         return False
 
     def _pose(self, body: int) -> np.ndarray:
-        """Return the pose (4, 4) of a body by its index."""
+        """Return the pose (4, 4) of a body, given its index."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
         return pose
 
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
-        """Drive a joint of the mount."""
+        """Set target [m] and target speed [m/s] of a joint of the mount."""
         self.data.ctrl[self.model.actuator(joint).id] = target + speed * MOUNT_DRIVE.kd / MOUNT_DRIVE.kp
 
 
 def _import_mujoco() -> Any:
-    """Import MuJoCo, whose warnings are counted (`_diverged`) instead of written to a file."""
+    """Import MuJoCo; its warnings are counted (`_diverged`) instead of written to a file."""
     try:
         import mujoco
     except ImportError as error:
@@ -153,9 +153,9 @@ def _import_mujoco() -> Any:
 
 
 def scene_mjcf(spec: SceneSpec) -> str:
-    """Return a scene as XML, all joints at zero.
+    """Return the MJCF model of a scene as XML; all joints are at zero.
 
-    Actuators are positional and named like their joints.
+    Actuators are position servos, named like their joints.
 
     Raises:
         BadArgument: a joint of the hand without a position or drive.
@@ -191,7 +191,7 @@ def scene_mjcf(spec: SceneSpec) -> str:
 
 
 def _add_body(asset: ET.Element, world: ET.Element, name: str, spec: Body, hits: int) -> None:
-    """Add a free body with the mass centre and inertia of an even filling, and the groups that it hits."""
+    """Add a free body with uniform density, and the collision groups that it hits."""
     body = ET.SubElement(world, "body", name=name)
     ET.SubElement(body, "freejoint", name=name)
     _weigh(body, spec.mass, spec.mesh.center_mass, spec.inertia[np.triu_indices(3)])
@@ -202,7 +202,7 @@ def _add_body(asset: ET.Element, world: ET.Element, name: str, spec: Body, hits:
 
 
 def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:
-    """Add the hand on its mount."""
+    """Add the hand on its mount to the world."""
     mount = world
     for slide in spec.slides:
         mount = ET.SubElement(mount, "body", name=slide.name, gravcomp="1")
@@ -215,7 +215,7 @@ def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:
 def add_links(
     parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray, masks: Mapping[str, tuple[int, int]] | None = None
 ) -> ET.Element:
-    """Add the links of a hand to a body; return the root's body. `masks` are those of `pair_masks`."""
+    """Add the links of a hand to a body; return the root's body. `masks` come from `pair_masks`."""
     masks = masks or {}
     links = {link.name: link for link in urdf.links}
     root = _add_link(parent, links[urdf.root], parent_from_root[:3, 3], parent_from_root[:3, :3], masks)
@@ -235,7 +235,7 @@ def add_links(
 def _add_link(
     parent: ET.Element, link: Link, place: Iterable[float], rotation: np.ndarray, masks: Mapping[str, tuple[int, int]]
 ) -> ET.Element:
-    """Add a link of the hand with its shapes."""
+    """Add a link of the hand, with its collision shapes, to its parent's body."""
     body = ET.SubElement(parent, "body", _frame(place, rotation), name=link.name, gravcomp="1")
     if link.mass > 0:
         _weigh(body, link.mass, link.com, link.inertia)
@@ -249,33 +249,33 @@ def _add_link(
 
 
 def add_drive(actuator: ET.Element, joint: str, drive: Actuator) -> None:
-    """Add a motor of torque kp (target - q) - kd dq/dt, limited to the effort."""
+    """Add a position servo: torque kp (target - q) - kd dq/dt, limited to the drive's effort."""
     gains = {"kp": repr(drive.kp), "kv": repr(drive.kd), "forcerange": format_numbers((-drive.effort, drive.effort))}
     ET.SubElement(actuator, "position", gains, name=joint, joint=joint)
 
 
 def _weigh(body: ET.Element, mass: float, centre: Iterable[float], inertia: Iterable[float]) -> None:
-    """Set a body's mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m^2]."""
+    """Set a body's mass [kg], centre of mass [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m^2]."""
     xx, xy, xz, yy, yz, zz = inertia
     tensor = format_numbers((xx, yy, zz, xy, xz, yz))
     ET.SubElement(body, "inertial", mass=repr(float(mass)), pos=format_numbers(centre), fullinertia=tensor)
 
 
 def _bits(kind: int, others: int) -> dict[str, str]:
-    """Return a shape's collision group and the groups it hits."""
+    """Return a shape's collision group, and the groups that it collides with, as attributes."""
     return {"contype": str(kind), "conaffinity": str(others)}
 
 
 def _frame(place: Iterable[float], rotation: np.ndarray) -> dict[str, str]:
-    """Return a pose as attributes: position and the first two axes."""
+    """Return a pose as MJCF attributes: position and the first two axes."""
     return {"pos": format_numbers(place), "xyaxes": format_numbers(rotation[:, :2].T.ravel())}
 
 
 def _rotation(rpy: tuple[float, float, float]) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of a URDF's angles."""
+    """Return the rotation matrix (3, 3) of roll, pitch and yaw [rad]."""
     return rotation_from_rpy(rpy).numpy()
 
 
 def format_numbers(numbers: Iterable[float]) -> str:
-    """Return numbers as the text of an attribute, without loss."""
+    """Return numbers as the text of an XML attribute, without loss of precision."""
     return " ".join(repr(float(x)) for x in numbers)

@@ -1,4 +1,4 @@
-"""A scene that SAPIEN simulates.
+"""A simulated scene in SAPIEN.
 
 Settings that differ from SAPIEN's defaults:
 
@@ -35,7 +35,7 @@ from torchgrasp.sim.scene_spec import (
 
 
 class Built(NamedTuple):
-    """SAPIEN's objects of a scene."""
+    """The handles of SAPIEN's objects in a scene."""
 
     system: Any
     scene: Any
@@ -45,7 +45,7 @@ class Built(NamedTuple):
 
 
 def build(spec: SceneSpec) -> Built:
-    """Return a scene with table, object and hand at their start.
+    """Return a new SAPIEN scene with table, object and hand at their initial poses.
 
     Raises:
         BadArgument: a joint of the hand without a position or drive.
@@ -74,7 +74,7 @@ def open_world(sapien: Any, physx: Any, gravity: float, timestep: float) -> tupl
 
 
 def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) -> None:
-    """Add an entity of one body to the scene, at a height [m]."""
+    """Add an entity with one body to the scene, at a height [m]."""
     entity = sapien.Entity()
     entity.name = name
     entity.add_component(body)
@@ -83,14 +83,14 @@ def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) ->
 
 
 def table(physx: Any, material: Any) -> Any:
-    """Return a box to put under the object."""
+    """Return a static box, the table."""
     body = physx.PhysxRigidStaticComponent()
     body.attach(physx.PhysxCollisionShapeBox(np.array(TABLE, np.float32) / 2, material))
     return body
 
 
 def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, patch: float) -> Any:
-    """Return a body with the mass centre and inertia of an even filling, and soft contacts of a radius [m]."""
+    """Return a dynamic body of uniform density; `patch` [m] is the radius of its contact patches."""
     body = physx.PhysxRigidDynamicComponent()
     for part in spec.parts:
         vertices = np.asarray(part.vertices, np.float32)
@@ -110,7 +110,7 @@ def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, patch: float)
 
 
 def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
-    """Load the hand on its mount and set it to its start."""
+    """Load the hand on its mount, and set it to its initial posture."""
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
@@ -143,7 +143,7 @@ def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
 
 
 def import_sapien() -> tuple[Any, Any]:
-    """Import SAPIEN, silencing its warning about a missing Vulkan: physics needs none."""
+    """Import SAPIEN; its warning about a missing Vulkan is suppressed, because physics does not need it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -155,7 +155,7 @@ def import_sapien() -> tuple[Any, Any]:
 
 
 class SapienScene(Scene):
-    """Table, object and hand in one SAPIEN scene."""
+    """A simulated scene in SAPIEN: table, object and hand."""
 
     def __init__(self, spec: SceneSpec) -> None:
         super().__init__(spec)
@@ -173,7 +173,7 @@ class SapienScene(Scene):
         self._map_joints()
 
     def _map_contacts(self) -> None:
-        """Map tips and their parent links to fingers, and other bodies to their place in `StepContacts.stray`."""
+        """Map tips and their parent links to fingers, and other bodies to their index in `StepContacts.stray`."""
         self._links = set(self.hand.links)
         self._finger_of = {link: i for i, link in enumerate(self.tips)}
         self._place_of = {self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
@@ -183,7 +183,7 @@ class SapienScene(Scene):
                 self._finger_of.setdefault(tip.parent, i)
 
     def _map_joints(self) -> None:
-        """Prepare the Jacobian: each driven joint's frame in its link, and the tips it moves."""
+        """Prepare the Jacobian: the frame of each driven joint in its link, and which tips the joint moves."""
         self._frames = np.array([_matrix(j.pose_in_child) for j in self._driven])
         self._children = [j.child_link for j in self._driven]
         self._slides = np.array([j.type == "prismatic" for j in self._driven])
@@ -224,9 +224,9 @@ class SapienScene(Scene):
         return contacts
 
     def _add_forces(self, contacts: StepContacts) -> None:
-        """Add the force of each touching fingertip, as a sensor at its base measures it.
+        """Add the force of each touching fingertip, as a sensor at the base of the tip measures it.
 
-        SAPIEN reports contacts without friction, but complete wrenches of incoming joints, in the child's joint frame.
+        SAPIEN reports contacts without friction, but the complete wrench at each link's joint, in the joint's frame.
         """
         touching = [i for i, weight in enumerate(contacts.weight.tolist()) if weight > 0.0]
         if touching:
@@ -259,7 +259,7 @@ class SapienScene(Scene):
         return columns.transpose(0, 2, 1)
 
     def penetration(self) -> float:
-        """Return the depth [m] of the hand in anything after a weightless step."""
+        """Return the largest penetration depth [m] of the hand, itself included, after a step without gravity."""
         bodies = [self.body, *self.neighbours]
         for body in bodies:
             body.disable_gravity = True
@@ -277,13 +277,13 @@ class SapienScene(Scene):
         return _matrix(body.entity_pose)
 
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
-        """Drive a joint of the mount."""
+        """Set target [m] and target speed [m/s] of a joint of the mount."""
         self._mount[joint].set_drive_target(float(target))
         self._mount[joint].set_drive_velocity_target(float(speed))
 
 
 def _matrix(pose: Any) -> np.ndarray:
-    """Return a pose of SAPIEN as a matrix (4, 4)."""
+    """Return a SAPIEN pose as a matrix (4, 4)."""
     return pose.to_transformation_matrix().astype(float)
 
 

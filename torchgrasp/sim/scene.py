@@ -1,6 +1,6 @@
-"""A simulated scene of one trial: table, object and a hand on a mount.
+"""A simulated scene for one trial: table, object and a hand on a mount.
 
-Every trial opens a fresh scene: only then do two runs give equal bits. The world's frame is that of the grasp.
+Every trial opens a fresh scene: only then are two runs bitwise equal. The world's frame is the frame of the grasp.
 """
 
 import abc
@@ -21,16 +21,16 @@ NEIGHBOURS, TABLETOP, TARGET = range(3)
 
 @dataclasses.dataclass(frozen=True)
 class StepContacts:
-    """True contacts of f fingers with the object, summed over a step.
+    """True contacts of f fingers with the object, summed over a simulation step.
 
     Args:
         impulse: normal impulse on the object (f, 3) [N s], without friction.
         moment: contact points weighted by the size of their impulse (f, 3) [N s m].
-        weight: sum of these sizes (f,) [N s]; `moment / weight` is the mean contact point.
-        finger: fingers that touch (f,), with the tip or with the link that carries the tip.
+        weight: sum of the impulse sizes (f,) [N s]; `moment / weight` is the mean contact point.
+        finger: whether each finger touches (f,), with its tip or with the link that carries the tip.
         force: force of each fingertip on the object (f, 3) [N], friction included.
-        stray: sums of normal impulses (3,) [N s] of the hand on neighbours, on the table, and of links other than
-            the fingers' on the object.
+        stray: sums of other normal impulses (3,) [N s]: of the hand on neighbours, of the hand on the table, and of
+            other links than fingertips on the object.
     """
 
     impulse: np.ndarray
@@ -43,13 +43,13 @@ class StepContacts:
     @classmethod
     @checked
     def none(cls, fingers: Annotated[int, Range(1, 1000)] = 3) -> "StepContacts":
-        """Return empty sums."""
+        """Return sums without any contact."""
         impulse, moment, force = np.zeros((3, fingers, 3))
         return cls(impulse, moment, np.zeros(fingers), np.zeros(fingers, dtype=bool), force, np.zeros(3))
 
     @checked
     def add(self, finger: Annotated[int, Range(0, 1000)], impulse: np.ndarray, size: float, point: np.ndarray) -> None:
-        """Add a contact of a fingertip: impulse [N s], size of the impulse, and place [m]."""
+        """Add a contact of one fingertip: its impulse [N s], the size of the impulse, and its position [m]."""
         if finger >= len(self.weight):
             raise BadArgument("finger", finger, f"one of {len(self.weight)}")
         check_vector("impulse", impulse)
@@ -60,7 +60,7 @@ class StepContacts:
 
     @checked
     def accumulate(self, step: "StepContacts", count: Count) -> None:
-        """Add one of `count` steps: impulses are summed, forces are averaged."""
+        """Add the contacts of one of `count` steps: impulses are summed, forces are averaged."""
         np.add(self.impulse, step.impulse, out=self.impulse)
         np.add(self.moment, step.moment, out=self.moment)
         np.add(self.weight, step.weight, out=self.weight)
@@ -68,10 +68,11 @@ class StepContacts:
 
 
 class Scene(abc.ABC):
-    """Table, object and hand. Arrays are in the world's axes; joints are in the order of `joint_names`.
+    """The interface of a simulated scene: table, object, neighbours and hand.
 
-    `centre` [m] is the object's mass centre in its own frame, `timestep` is in seconds. A simulator sets `joint_names`
-    and its handles of bodies.
+    Arrays are in the world's axes; joints are in the order of `joint_names`. `centre` [m] is the object's centre of
+    mass in its own frame, `timestep` is in seconds. A simulator's subclass sets `joint_names` and the handles of
+    bodies.
 
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand, pose = load_object("jug"), load_hand("barrett"), np.eye(4)
@@ -120,15 +121,15 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return d points / d driven joints (f, 3, j) of points on the fingertips."""
+        """Return the Jacobian (f, 3, j) of points on the fingertips by the driven joints."""
 
     @abc.abstractmethod
     def penetration(self) -> float:
-        """Return the initial depth [m] of the hand in anything, itself included."""
+        """Return the largest initial penetration depth [m] of the hand, itself included."""
 
     @abc.abstractmethod
     def _pose(self, body: Any) -> np.ndarray:
-        """Return the pose (4, 4) of a body by its handle."""
+        """Return the pose (4, 4) of a body, given its handle."""
 
     @abc.abstractmethod
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
@@ -136,17 +137,17 @@ class Scene(abc.ABC):
 
     @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set target height [m] and speed [m/s] of the hand."""
+        """Set the target height [m] and the speed [m/s] of the hand's lift."""
         self._move_mount(LIFT_JOINT, height, speed)
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set the remaining length [m] of the approach, and its speed [m/s]."""
+        """Set the target of the remaining approach length [m], and the speed [m/s]."""
         self._move_mount(APPROACH_JOINT, -left, speed)
 
     @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
-        """Set the target displacement [m] of the hand from its path, and its velocity [m/s], if its mount yields."""
+        """Set the target displacement [m] of the hand from its path and its velocity [m/s], if the mount can yield."""
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
             check_vector(name, vector)
         for joint, target, speed in zip(SHIFT_JOINTS, displacement, velocity, strict=True):
@@ -165,11 +166,11 @@ class Scene(abc.ABC):
         return self._pose(self.root)
 
     def tip_poses(self) -> np.ndarray:
-        """Return the poses (f, 4, 4) of the fingertips' links."""
+        """Return the poses (f, 4, 4) of the fingertip links."""
         return np.array([self._pose(tip) for tip in self.tips])
 
 
 def check_vector(name: str, vector: np.ndarray) -> None:
-    """Refuse an array of another shape than (3,), or of what is no number."""
+    """Raise `BadArgument` unless an array holds three numbers."""
     if vector.shape != (3,) or vector.dtype.kind not in "iuf":
         raise BadArgument(name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers")

@@ -34,7 +34,7 @@ SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z"
 @checked
 @dataclasses.dataclass(frozen=True)
 class Neighbour:
-    """A body beside the object.
+    """Another body on the table, beside the object.
 
     Args:
         mesh: closed mesh [m] in the frame of the grasp.
@@ -54,7 +54,7 @@ class Neighbour:
 @checked
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A rigid body of the simulator: its mesh, convex parts that make up the mesh, and its mass [kg]."""
+    """A rigid body: its mesh, the convex parts that make up the mesh, and its mass [kg]."""
 
     mesh: "trimesh.Trimesh"
     parts: "Sequence[trimesh.Trimesh]"
@@ -62,13 +62,13 @@ class Body:
 
     @property
     def inertia(self) -> np.ndarray:
-        """The inertia (3, 3) [kg m^2] of an even filling about the mass centre."""
+        """The inertia (3, 3) [kg m^2] about the centre of mass, for uniform density."""
         return np.asarray(self.mesh.moment_inertia) * (self.mass / self.mesh.volume)
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneSpec:
-    """Parameters of a scene.
+    """Parameters of a simulated scene.
 
     Args:
         urdf_path: URDF of the hand.
@@ -76,20 +76,20 @@ class SceneSpec:
         joints: start position of every joint of the URDF by name [rad].
         drives: drive of every joint by name.
         tip_links: links of the f fingertips, in grasp order.
-        mesh: the closed object, which gives table height, mass centre and inertia.
+        mesh: closed mesh of the object, which gives table height, centre of mass and inertia.
         parts: convex bodies that make up the object.
         mass: mass of the object [kg].
         friction: friction coefficient of every contact.
         gravity: gravity [m/s^2].
         timestep: timestep of the simulator [s].
         travel: largest height [m] of a lift.
-        approach: displacement [m] from the hand's start to its pose.
+        approach: displacement [m] from the hand's start to the pose `world_from_hand`.
         table: whether there is a table.
         patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x patch.
         height: height of the table [m]; None: the lowest point of the mesh.
-        neighbours: further bodies.
+        neighbours: other bodies on the table.
         self_pairs: pairs of the hand's links that collide with each other.
-        yields: largest displacement [m] of the mount along each axis of the world; 0: it does not yield.
+        yields: largest displacement [m] of the mount along each axis of the world; 0: the mount is stiff.
 
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand = load_object("jug"), load_hand("barrett")
@@ -120,12 +120,12 @@ class SceneSpec:
 
     @functools.cached_property
     def urdf(self) -> Urdf:
-        """The hand; raises `HandFileError` for a file that is not a valid URDF."""
+        """The URDF of the hand; raises `HandFileError` if it is not valid."""
         return read_urdf(self.urdf_path)
 
     @functools.cached_property
     def slides(self) -> list["Slide"]:
-        """Return the joints of the mount, from the world to the hand."""
+        """The prismatic joints of the mount, from the world to the hand."""
         slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, self.travel + 0.05, 0.0)]
         length = float(np.linalg.norm(self.approach))
         if length > 0:
@@ -149,7 +149,7 @@ class SceneSpec:
 
     @checked
     def check_drives(self, names: list[str]) -> None:
-        """Refuse joints without a start position or a drive."""
+        """Raise `BadArgument` for joints without an initial position or a drive."""
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
             raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
@@ -162,7 +162,7 @@ WRIST_JOINT = "torchgrasp_wrist"  # name of the fixed joint between mount and ha
 
 
 class Slide(NamedTuple):
-    """A prismatic joint of the mount: name, axis in the world, limits, start [m]."""
+    """A prismatic joint of the mount: name, axis in the world, limits and start [m]."""
 
     name: str
     axis: tuple[float, float, float]
@@ -174,8 +174,8 @@ class Slide(NamedTuple):
 def mounted_urdf(spec: SceneSpec) -> str:
     """Return the URDF of the hand on its mount.
 
-    It has no `<visual>`, which needs a render device, and no `<mimic>`: SAPIEN's mimic joints transmit wrong forces, so
-    coupled joints get their own targets.
+    `<visual>` elements are left out, because they need a render device. `<mimic>` elements are left out, because
+    SAPIEN's mimic joints transmit wrong forces; coupled joints get their own targets instead.
 
     Raises:
         HandFileError: the file is not a valid URDF (`read_urdf`).
@@ -207,9 +207,9 @@ def mounted_urdf(spec: SceneSpec) -> str:
 
 
 def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
-    """Return a URDF's roll, pitch, yaw [rad]: R = Rz(yaw) Ry(pitch) Rx(roll).
+    """Return the roll, pitch and yaw [rad] of a rotation, as in URDF: R = Rz(yaw) Ry(pitch) Rx(roll).
 
-    At a pitch of 90 degrees only yaw - roll is determined; roll is 0 there.
+    At a pitch of 90 degrees only yaw - roll is determined; roll is then 0.
     """
     sine = -float(rotation[2, 0])
     cosine = math.hypot(float(rotation[0, 0]), float(rotation[1, 0]))
@@ -221,13 +221,13 @@ def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[int, int]]:
-    """Return for each link of the pairs its own bits, and the bits that it collides with.
+    """Return for each link in `pairs` two bit masks: its collision group, and the groups that it collides with.
 
-    Two links collide if the bits of one share a bit with those that the other collides with, as in PhysX and MuJoCo.
-    Only one link of each pair needs a bit of its own.
+    Two links collide if the group of one shares a bit with the mask of the other, as in PhysX and MuJoCo. Only one link
+    of each pair needs its own bit.
 
     Args:
-        pairs: names of links.
+        pairs: pairs of link names that collide.
         first: first free bit.
 
     Raises:

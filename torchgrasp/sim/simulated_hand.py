@@ -1,4 +1,4 @@
-"""A scene in the simulator that is asked for, and its hand as a controller knows it: targets in, observations out."""
+"""A simulated scene seen by a controller: joint and palm targets in, observations of the hand out."""
 
 import math
 from typing import Annotated
@@ -16,7 +16,7 @@ from torchgrasp.specs import Simulator
 
 @checked
 def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> Scene:
-    """Return a fresh scene at its start.
+    """Return a fresh scene of a simulator, at its initial state.
 
     Raises:
         BadArgument: an unknown simulator, or a joint of the hand without a position or drive.
@@ -40,7 +40,7 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> Scene:
 
 
 class SimulatedHand:
-    """The hand of a scene, with sensors in its fingertips.
+    """The simulated hand for a controller: it takes targets, and returns observations of joints and fingertip sensors.
 
     `truth` holds the contacts of the last tick. `force` (f,) are the true normal forces [N], averaged over the tick,
     `pushes` (f, 3) the full forces. `finger` flags contacts in the last step. `steps` counts steps of the simulator.
@@ -49,9 +49,9 @@ class SimulatedHand:
     largest force [N] over a tick.
 
     Args:
-        scene: a scene at its start.
-        reference: what the hand follows.
-        control_rate: ticks a second [Hz].
+        scene: a scene at its initial state.
+        reference: the closing plan.
+        control_rate: rate of control ticks [Hz].
         generator: draws the noise of the fingertips; None: no noise.
 
     >>> from torchgrasp import load_hand, load_object
@@ -113,7 +113,7 @@ class SimulatedHand:
         return self._observe(contacts)
 
     def unbalanced(self) -> float:
-        """Return the size of the sum of the fingertips' forces over the sum of their sizes; NaN without forces."""
+        """Return the ratio of the resultant of all fingertip forces to the sum of their sizes; NaN without forces."""
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan
 
@@ -123,7 +123,7 @@ class SimulatedHand:
         return max(1, round(seconds / self.period))
 
     def _observe(self, contacts: StepContacts) -> Observation:
-        """Return the observation of the hand: its joints, and contacts as its fingertips sense them."""
+        """Return the observation of the hand, given the true contacts of the tick."""
         world_from_hand = self.scene.hand_pose()
         rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
         tips = self.scene.tip_poses()
