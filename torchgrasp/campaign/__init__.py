@@ -1,4 +1,4 @@
-"""Campaigns: a data set of clouds, grasps, certificates and verdicts, made on processes here or on a cluster."""
+"""Campaigns: data sets of clouds, grasps, certificates and simulated verdicts, made by many processes or machines."""
 
 from torchgrasp.campaign.run import CampaignSpec
 from torchgrasp.campaign.run import run_campaign

@@ -1,4 +1,4 @@
-"""A job, planned and tried anywhere, and jobs on a Dask cluster, where a worker that dies costs its own job alone."""
+"""One job of a campaign, and running jobs on a Dask cluster, where a worker that dies loses only its own job."""
 
 import importlib.metadata
 import json
@@ -24,7 +24,7 @@ CONNECTING = "30s"  # longest time for the scheduler to answer
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of `PACKAGES` here; "none" where one is not installed."""
+    """Return the installed versions of `PACKAGES`; "none" for a package that is not installed."""
     from torchgrasp import __version__
 
     found = {"torchgrasp": __version__}  # of the source that runs; an installation may be older
@@ -37,17 +37,18 @@ def versions() -> dict[str, str]:
 
 
 def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str]) -> bytes:
-    """Return the file of the shard that holds this job alone.
+    """Plan and try the grasps of one job; return the bytes of a shard file that holds only this job.
 
     Args:
-        view: its object, and the hand.
-        protocol: of the trials.
-        spec: which grasps are tried.
-        meta: of the file; `versions` are those that the campaign was begun with.
+        view: the object, its view and the hand.
+        protocol: protocol of the trials.
+        spec: options of planning and trials.
+        meta: metadata of the shard; `versions` are the package versions with which the campaign began.
 
     Raises:
         BadArgument: other versions or another hand than the campaign's, as on a machine of a cluster.
-        MissingExtra, OutputError, OSError: no fault of the object, whose own files are refused by name.
+        MissingExtra, OutputError, OSError: errors that are not the object's fault; bad files of the object give a row
+            with the reason.
     """
     hand, here = view.load_hand(), json.dumps(versions())
     if here != meta["versions"]:
@@ -65,7 +66,7 @@ def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str
 
 
 def _work(view: View, hand: Hand, protocol: Protocol, spec: EvaluationSpec) -> Shard:
-    """Plan, and try the chosen grasps."""
+    """Plan grasps on the view of a job, and try the chosen grasps in simulation."""
     score, cloud, found = plan_view(view, protocol.trial.friction, spec)
     row = JobRow(view.object, view.view, score.refusal, short(score.note), score.family, score.group)
     if cloud is None or found is None:
@@ -83,7 +84,7 @@ def _work(view: View, hand: Hand, protocol: Protocol, spec: EvaluationSpec) -> S
 
 
 def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
-    """Return the shard of a job without cloud and grasps."""
+    """Return the shard of a job without a cloud and without grasps."""
     points, tried = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, draws, dtype=torch.int64)
     return Shard((row,), Records(points, torch.zeros(1, 3, dtype=torch.float64), no_grasps(hand), tried.bool(), tried))
 
@@ -91,16 +92,16 @@ def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
 def run_on_cluster(
     function: Callable[..., Result], tasks: Sequence[tuple[Any, ...]], address: str, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Yield the number of each task and `function(*task)`, in the order in which they end.
+    """Run tasks on a Dask cluster; yield the index of each task and its result, in the order in which they end.
 
     A task whose worker dies is given to another one; after the deaths that the scheduler allows
     (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task that takes longer
-    than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. Tasks that nobody works on wait for workers.
+    than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. Tasks wait until a worker is free.
 
     Raises:
         MissingExtra: Dask is not installed.
-        BadArgument: no scheduler answers at the address, or it ends.
-        Exception: of a task, when it ends.
+        BadArgument: no scheduler answers at the address, or the scheduler ends.
+        Exception: the error of a task, when the task ends.
     """
     try:
         from distributed import CancelledError, Client, Event, KilledWorker, as_completed
@@ -137,9 +138,9 @@ def run_on_cluster(
 
 
 def _bounded(function: Callable[..., Result], limit: float, name: str, *task: Any) -> Result | Status:
-    """Call a function on one thread of a worker, which ends if it takes longer: nothing else stops a simulator.
+    """Call a function on one thread of a worker process; end the process if the call takes longer than `limit` [s].
 
-    An event on the scheduler tells the worker that is given the task next that it was late before.
+    Nothing else can stop a simulator. An event on the scheduler tells the next worker of this task that it was late.
     """
     from distributed import Event
 

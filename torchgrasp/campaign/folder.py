@@ -1,4 +1,4 @@
-"""The folder of a campaign: finished jobs, each as a file until its shard is whole; then the cards."""
+"""The folder of a campaign: one file for each finished job until its shard is complete, and the data set's cards."""
 
 import contextlib
 import hashlib
@@ -44,9 +44,9 @@ FIELDS = (
 
 
 class Campaign(NamedTuple):
-    """What is asked, as `campaign.json` has it, and a row for each job.
+    """The request of a campaign, as in `campaign.json`, and one row for each job.
 
-    A row whose status is not OK is refused before any work.
+    A row whose status is not OK needs no work.
     """
 
     asked: dict[str, Any]
@@ -60,7 +60,7 @@ class Campaign(NamedTuple):
 
     @property
     def meta(self) -> dict[str, str]:
-        """What the metadata of each shard says."""
+        """The metadata of each shard: hash of the request, and package versions."""
         digest = hashlib.sha256(self.text.encode()).hexdigest()
         return {"campaign": digest, "versions": json.dumps(self.asked["versions"])}
 
@@ -68,7 +68,7 @@ class Campaign(NamedTuple):
 def carry_out(
     campaign: Campaign, folder: Path, work: Work, observer: Callable[[JobRow], object] = lambda row: None
 ) -> GraspShards:
-    """Do all jobs that a folder lacks, and finish it; the observer gets the row of each job that was done.
+    """Run all jobs that a folder lacks, and complete its data set; the observer is called with each finished job's row.
 
     Raises:
         OutputError: the folder holds another campaign or other files, another run holds it, or it cannot be written.
@@ -102,7 +102,7 @@ def carry_out(
 
 
 class _Store:
-    """The files of a campaign; `rows` are those of the jobs that are on disk and sound."""
+    """The files of a campaign; `rows` holds the rows of all jobs that are on disk and undamaged."""
 
     def __init__(self, campaign: Campaign, folder: Path) -> None:
         self.campaign, self.folder = campaign, folder
@@ -114,18 +114,18 @@ class _Store:
             self._look(k)
 
     def missing(self) -> list[int]:
-        """Return the jobs that have to be done."""
+        """Return the indices of the jobs that still have to run."""
         return [j for j in range(len(self.campaign.rows)) if j not in self.rows]
 
     def put(self, j: int, data: bytes) -> JobRow:
-        """Write the file of a job; return its row."""
+        """Write the file of a finished job; return its row."""
         row = self._row_of(j, load_shard(write_file(self._part(j), data), self.campaign.meta))
         self.rows[j] = row._replace(meta={})
         self._close(j // self.size)
         return self.rows[j]
 
     def finish(self) -> None:
-        """Write the cards, that for programs last, and remove what is no more needed."""
+        """Write both cards, the JSON card last, and remove the folder of single jobs."""
         rows = tuple(self.rows[j] for j in range(len(self.campaign.rows)))
         digests = [self.digests[k] for k in self.shards]
         card = card_of(self.campaign.asked, self.campaign.meta["campaign"], rows, digests)
@@ -135,7 +135,7 @@ class _Store:
             (self.folder / PARTS).rmdir()
 
     def _look(self, k: int) -> None:
-        """Find the sound jobs of a shard: in its file, or each in its own."""
+        """Find the undamaged jobs of shard k: in the shard's file, or each in its own file."""
         settled = {j: row for j, row in self._saved(k).items() if row.status not in FAILED}
         self.rows |= settled
         if len(settled) == len(self._jobs(k)):
@@ -150,7 +150,7 @@ class _Store:
         self._close(k)
 
     def _saved(self, k: int) -> dict[int, JobRow]:
-        """Return the rows of a shard's file; none if it is not there, or damaged."""
+        """Return the rows in the file of shard k; none if the file is missing or damaged."""
         try:
             shard = load_shard(shard_path(self.folder, k), self.campaign.meta)
             jobs = self._jobs(k)
@@ -161,7 +161,7 @@ class _Store:
             return {}
 
     def _close(self, k: int) -> None:
-        """Write a shard whose jobs have all ended."""
+        """Write shard k if all of its jobs have finished."""
         if any(j not in self.rows for j in self._jobs(k)):
             return
         path, parts = shard_path(self.folder, k), []
@@ -174,21 +174,21 @@ class _Store:
         self._settle(k)
 
     def _settle(self, k: int) -> None:
-        """Note the hash of a shard that is whole, and remove the files of its jobs."""
+        """Store the hash of the complete shard k, and remove the files of its jobs."""
         self.digests[k] = sha256(shard_path(self.folder, k))
         for j in self._jobs(k):
             remove_file(self._part(j))
 
     def _jobs(self, k: int) -> range:
-        """Return the jobs of a shard."""
+        """Return the indices of the jobs in shard k."""
         return range(k * self.size, min((k + 1) * self.size, len(self.campaign.rows)))
 
     def _part(self, j: int) -> Path:
-        """Return the file of a job that is not yet in its shard."""
+        """Return the path of the file of job j, used until its shard is complete."""
         return self.folder / PARTS / f"job-{j:06d}.safetensors"
 
     def _row_of(self, j: int, shard: Shard) -> JobRow:
-        """Return the row of a shard of one job; refuse that of another job."""
+        """Return the row of a shard with one job; raise `ModelFileError` if it is not job j."""
         row, asked = shard.rows[0], self.campaign.rows[j]
         if len(shard.rows) != 1 or (row.object, row.view) != (asked.object, asked.view):
             raise ModelFileError("path", f"{(row.object, row.view)}", f"{(asked.object, asked.view)}")
@@ -196,12 +196,12 @@ class _Store:
 
 
 def card_of(asked: dict[str, Any], campaign: str, rows: Sequence[JobRow], digests: Sequence[str]) -> dict[str, Any]:
-    """Return the content of `card.json`.
+    """Return the content of `card.json`, which describes a data set.
 
     Args:
         asked: content of `campaign.json`.
-        campaign: its SHA-256, which each shard names.
-        rows: of all jobs.
+        campaign: SHA-256 of `campaign.json`, which each shard names.
+        rows: rows of all jobs.
         digests: SHA-256 of each shard.
     """
     tries = asked["protocol"]["noise"]["draws"]
@@ -231,7 +231,7 @@ def card_of(asked: dict[str, Any], campaign: str, rows: Sequence[JobRow], digest
 
 
 def describe(card: dict[str, Any]) -> str:
-    """Return the card in Markdown, with the header that hubs of data sets read."""
+    """Return the card as Markdown, with the header that data set hubs read."""
     asked, counts = card["asked"], card["counts"]
     hand, protocol, trials = asked["hand"], asked["protocol"], asked["trials"]
     reasons = "\n".join(f"| {name.lower()} | {n} | {Status[name].sentence} |" for name, n in counts["status"].items())
@@ -282,5 +282,5 @@ p points, j jobs, g grasps, d tries of a grasp, h joints ({hand["joint_names"]})
 
 
 def _quoted(text: str) -> str:
-    """Return a text for a header in YAML."""
+    """Return a text as a YAML value for the header."""
     return text.lower() if text.replace("-", "").replace(".", "").isalnum() else '"' + text.replace('"', "'") + '"'

@@ -1,4 +1,4 @@
-"""A campaign on a folder of objects: from views to a data set on disk."""
+"""A campaign on a folder of objects: from views to a data set of grasps on disk."""
 
 import dataclasses
 from collections.abc import Callable, Generator, Sequence
@@ -26,13 +26,13 @@ LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list hav
 @checked
 @dataclasses.dataclass(frozen=True)
 class CampaignSpec(Value):
-    """What is planned, tried and written.
+    """Options of a campaign: protocol, trials, licence and size of the files.
 
     Args:
-        protocol: the test that each grasp is put to: itself, or its name in `torchgrasp.evaluation.PROTOCOLS`.
-        trials: which views, and how many of their grasps. The hand's own fingers grasp.
-        licence: of the data set, as its card names it; an SPDX identifier such as "CC-BY-4.0" is understood widely.
-        jobs_in_shard: objects and views whose records share a file.
+        protocol: test protocol of each grasp, or its name in `torchgrasp.evaluation.PROTOCOLS`.
+        trials: which views are planned on, and how many of their grasps are tried, with the hand's own fingers.
+        licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
+        jobs_in_shard: number of jobs (an object and a view) in one file.
 
     Raises:
         BadArgument: an unknown protocol, or trials of whole clouds, of grasps that were planned before, or of other
@@ -48,7 +48,7 @@ class CampaignSpec(Value):
     jobs_in_shard: Annotated[int, Range(1, 10_000)] = 64
 
     def __post_init__(self) -> None:
-        """Check what depends on two fields."""
+        """Check fields that depend on each other."""
         trials = self.trials
         if trials.planned or trials.complete or trials.fingers is not None:
             found = next(name for name in ("planned", "complete", "fingers") if getattr(trials, name))
@@ -58,7 +58,7 @@ class CampaignSpec(Value):
 
     @property
     def test(self) -> Protocol:
-        """The protocol itself."""
+        """The test protocol."""
         return find_protocol(self.protocol)
 
 
@@ -71,21 +71,21 @@ def run_campaign(
     workers: Annotated[int, Range(0, 1024)] | str = 0,
     observer: Callable[[JobRow], object] = lambda row: None,
 ) -> GraspShards:
-    """Plan on every view of a folder of objects, try the grasps in simulation, and write a data set of them.
+    """Plan on every view of a folder of objects, try the grasps in simulation, and write a data set of the results.
 
-    Each job, one object and view, ends with a row: its grasps, or the reason why there are none. Each is on disk as
-    soon as it ended. The same call continues a run that was interrupted or killed, and tries again what failed
-    (`WORKER_DIED`, `TIMED_OUT`, `BROKEN`). Equal results give equal bytes, whatever the workers, their order and the
-    interruptions (docs/promises.md, N10, on equal results).
+    Each job, one object and view, gives a row: its grasps, or the reason why there are none. A finished job is on disk
+    at once. The same call continues an interrupted run, and retries failed jobs (`WORKER_DIED`, `TIMED_OUT`, `BROKEN`).
+    Equal results give equal bytes, whatever the workers, their order and the interruptions (docs/promises.md, N10, on
+    equal results).
 
     Args:
         objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every machine.
-        hand: from `load_hand`; its fingers grasp.
-        folder: of the data set; no other run may write it meanwhile.
+        hand: from `load_hand`, with the fingers that grasp.
+        folder: folder of the data set; no other run may write to it at the same time.
         spec: what is planned and tried; None: `CampaignSpec()`.
         workers: processes here, 0: this one; or the address of a Dask scheduler, as "tcp://10.0.0.1:8786", whose
             workers have one thread each.
-        observer: called with the row of each job that was done.
+        observer: called with the row of each finished job.
 
     Raises:
         BadArgument: no objects, no scheduler at the address, or a machine with other versions or another hand.
@@ -139,7 +139,7 @@ def run_campaign(
 
 
 def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:
-    """Return a row for each view of each object, in order; one for an object with a bad entry."""
+    """Return one row for each view of each object, in order; a single row for an object with a bad entry."""
     rows: list[JobRow] = []
     for name, entry in read_entries(objects, spec.trials.only).items():
         if isinstance(entry, DatasetError):

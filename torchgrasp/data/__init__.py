@@ -1,4 +1,4 @@
-"""Objects that are shipped, folders of objects and views, and shards of grasps."""
+"""Shipped objects, folders of objects and views, and data sets of grasps in shards."""
 
 from torchgrasp.data.shipped import GraspObject, list_objects, load_object, load_scene, load_shipped_grasp
 from torchgrasp.data.manifest import ObjectEntry as ObjectEntry, read_entries as read_entries, read_entry as read_entry

@@ -1,10 +1,12 @@
 """Folders of objects: true meshes and views of them.
 
-`manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera" (4x4). Its folder
-has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. Readers apply the object's "suggested_scale" (default 1).
-"mass_kg", "family" and "group" are optional.
+`manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera" (4x4). An object's
+folder has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply the object's "suggested_scale"
+(default 1), which makes it graspable. Optional are "mass_kg", the "family" of similar objects, and the "group", such as
+"solid".
 
-A folder from a stranger may hold anything: a name is one part of a path, and no file outside the folder is read.
+A folder from a stranger may hold anything. A name of an object or a view is one part of a path, and no file outside the
+folder is read.
 """
 
 import dataclasses
@@ -33,11 +35,11 @@ MESHES = (".ply", ".stl", ".obj", ".off")  # suffixes of the meshes that `write_
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEntry:
-    """The manifest's entry of an object.
+    """An object's entry in the manifest.
 
     Args:
         views: position [m] of the camera of each view by name, at scale 1.
-        scale: factor of mesh and clouds.
+        scale: scale factor of mesh and clouds.
         family: family of similar objects; the object's own name by default.
         group: group of objects such as "solid", "thin" or "shell"; "" by default.
         mass: mass [kg] of the real object at any scale, or None.
@@ -50,24 +52,24 @@ class ObjectEntry:
     mass: float | None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
-        """Return the sorted names of at most `most` views; with `whole` only `WHOLE`."""
+        """Return the sorted names of the views, at most `most`; with `whole` only the view `WHOLE`."""
         return ([WHOLE] if whole else sorted(self.views))[:most]
 
 
 @checked
 def read_entry(objects: Path | str, name: str) -> ObjectEntry:
-    """Return the entry of an object.
+    """Return an object's entry in the manifest, checked.
 
     Raises:
-        DatasetError: no such object, a missing field, a field of a wrong type or range, or a name that is no name of a
-            folder.
+        DatasetError: no such object, a missing field, a field of a wrong type or range, or a name that cannot be the
+            name of a folder.
     """
     return _parse_entry(name, _read_fields(objects, [name])[name])
 
 
 @checked
 def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, ObjectEntry | DatasetError]:
-    """Return the entry of each object, or the error in its entry, sorted by name; `only` selects objects.
+    """Return each object's entry in the manifest, sorted by name, or the error of a bad entry.
 
     Raises:
         DatasetError: no manifest, or none of the objects in it.
@@ -82,7 +84,7 @@ def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, Obj
 
 
 def _parse_entry(name: str, field: Field) -> ObjectEntry:
-    """Check the entry of an object and return it."""
+    """Check an object's entry in the manifest, and return it."""
     _check_name(field, name)
     fields, views = field.entries(), {}
     if "views" not in fields:
@@ -108,16 +110,17 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
 
 @checked
 def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0) -> list[str]:
-    """Make a folder of objects from a folder of meshes; return the objects' names, which are those of the files.
+    """Make a folder of objects from a folder of mesh files; return the objects' names, those of the files.
 
-    Each mesh is moved: its lowest point to z = 0, the middle of its box above the origin. The depth camera of
-    `partial_view` sees it from random sides. The manifest is written last, so a folder with a manifest is complete.
+    Each mesh is moved so that its lowest point is at z = 0 and the middle of its box above the origin. Each view is
+    rendered by the depth camera of `partial_view` from a random side. The manifest is written last, so that a folder
+    with a manifest is complete.
 
     Args:
         meshes: folder of closed meshes [m], z up (.ply, .stl, .obj, .off).
         out: folder to write.
         views: number of views of each object.
-        seed: seed of the cameras and of their noise.
+        seed: random seed of cameras and noise.
 
     Raises:
         DatasetError: no meshes, or two meshes of one name.
@@ -157,7 +160,7 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
 
 
 def _check_name(field: Field, name: str) -> None:
-    """Refuse a name that is more than one part of a path or not printable."""
+    """Raise the field's error for a name that is more than one part of a path, or that is not printable."""
     longest_name = 100  # most letters of a name: file names have 255 bytes
     plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
     if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= longest_name:
@@ -169,9 +172,9 @@ def _check_name(field: Field, name: str) -> None:
 def list_views(
     objects: Path | str, whole: bool = False, only: Sequence[str] = (), most: Count | None = None
 ) -> list[tuple[str, str]]:
-    """Return sorted pairs of object and view, at most `most` views of an object.
+    """Return sorted pairs of object and view, at most `most` views of each object; None: all.
 
-    `only` selects objects; with `whole` each object has the view `WHOLE` alone.
+    `only` selects objects; with `whole` each object has the single view `WHOLE`.
 
     Raises:
         DatasetError: no manifest, none of the objects in it, or a bad entry.
@@ -182,7 +185,7 @@ def list_views(
 
 @checked
 def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
-    """Return a noisy view without normals, with its viewpoint if `camera`.
+    """Return the point cloud of a noisy view without normals, with its viewpoint if `camera`.
 
     Raises:
         DatasetError: as `read_entry`, or no such view.
@@ -207,7 +210,7 @@ def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
 
 
 def _file(objects: Path | str, name: str, file: str) -> Path:
-    """Return the path of an object's file; refuse a link to a file outside the folder."""
+    """Return the path of an object's file; raise `DatasetError` if it is a link to a file outside the folder."""
     path, folder = Path(objects) / name / file, Path(objects).resolve()
     if not path.resolve().is_relative_to(folder):
         raise DatasetError("objects", f"{path}, which is {path.resolve()}", f"files within {folder}")
@@ -215,7 +218,7 @@ def _file(objects: Path | str, name: str, file: str) -> Path:
 
 
 def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
-    """Return the fields of the objects `only`, or of all objects if `only` is empty."""
+    """Return the manifest's entries of the objects in `only`; of all objects if `only` is empty."""
 
     def refuse(found: str, allowed: str) -> DatasetError:
         return DatasetError("objects", found, allowed)

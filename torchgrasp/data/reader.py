@@ -1,4 +1,4 @@
-"""Data sets of grasps, read grasp by grasp for learning, or job by job."""
+"""Reader of a campaign's data set, grasp by grasp for learning, or job by job."""
 
 import bisect
 import dataclasses
@@ -23,9 +23,9 @@ CARD = "card.json"  # file that describes a data set; it is written last, so a f
 
 
 class ShardJob(NamedTuple):
-    """A job of a data set: its row, its cloud (None: no view was read) and the grasps that were tried.
+    """One job of a data set: its row, the cloud (None: no view was read) and the grasps that were tried.
 
-    `passed` and `outcome` (a `Status`) have a row for each grasp and a column for each try in the simulator.
+    `passed` and `outcome` (a `Status`) have a row for each grasp, and a column for each simulated trial.
     """
 
     row: JobRow
@@ -37,7 +37,7 @@ class ShardJob(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class GraspShards:
-    """A data set of grasps on disk, from `read_shards`; a map-style dataset for `torch.utils.data.DataLoader`.
+    """A data set of grasps on disk; a map-style dataset for `torch.utils.data.DataLoader`.
 
     `len` counts the grasps. Item i is a dict of float32 tensors [m, rad] in the object's frame: `points` (n, 3) and
     `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach` (3,), `obj_from_hand` (4, 4); `contacts` and
@@ -61,7 +61,7 @@ class GraspShards:
 
     @functools.cached_property
     def starts(self) -> list[int]:
-        """Index of each job's first grasp, and the number of grasps at the end."""
+        """The index of each job's first grasp, and the total number of grasps at the end."""
         return list(itertools.accumulate((row.grasps for row in self.jobs), initial=0))
 
     def __len__(self) -> int:
@@ -71,7 +71,7 @@ class GraspShards:
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, i: int) -> dict[str, Tensor]:
-        """Return grasp i.
+        """Return grasp i as a dict of tensors.
 
         Raises:
             IndexError: no such grasp.
@@ -105,7 +105,7 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Return job j in the precision of the file.
+        """Read job j, in the precision of the file.
 
         Raises:
             IndexError: no such job.
@@ -119,7 +119,7 @@ class GraspShards:
         return ShardJob(row[0], cloud, grasps, records.passed, records.outcome)
 
     def _read(self, k: int) -> Shard:
-        """Read shard k and compare its rows with the card's."""
+        """Read shard k, and check its rows against the card."""
         path = shard_path(self.folder, k)
         shard = load_shard(path, {"campaign": str(self.card["campaign"])})
         bare = tuple(row._replace(meta={}) for row in shard.rows)
@@ -129,13 +129,13 @@ class GraspShards:
 
 
 def shard_path(folder: Path, k: int) -> Path:
-    """Return the file of shard k."""
+    """Return the path of shard k."""
     return folder / f"shard-{k:06d}.safetensors"
 
 
 @checked
 def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
-    """Open the data set that a campaign wrote; shards are read on demand.
+    """Open a data set that a campaign has written; shards are read on demand.
 
     Args:
         folder: folder of the data set.

@@ -1,4 +1,4 @@
-"""A shard: the records of some jobs of a campaign in one file. A job is one object and view."""
+"""A shard: one file with the records of several jobs of a campaign. A job is one object and view."""
 
 import dataclasses
 import itertools
@@ -22,11 +22,11 @@ MOST = 1_000_000  # most points, grasps and tries of one job
 
 
 class JobRow(NamedTuple):
-    """The outcome of a job.
+    """The outcome of one job: status, counts of grasps and trials, metadata.
 
-    `status` is OK, or the reason why there is no grasp; `note` holds details. `executable`, `grasps` and `passed` count
-    the planned grasps, the grasps that were tried, and the tries that passed. `points` counts the points of the cloud.
-    `meta` is the metadata of `Grasps`.
+    `status` is OK, or the reason why there is no grasp: the most frequent failure, a bad object, or how the process
+    ended. `note` gives details. `executable` grasps were planned; `grasps` of them were kept and tried; `passed` is the
+    number of trials that passed. `points` is the size of the cloud. `meta` is that of `Grasps`.
 
     >>> JobRow("mug", "view0", Status.NOT_CLOSED, points=1000).as_json()["status"]
     'NOT_CLOSED'
@@ -45,16 +45,16 @@ class JobRow(NamedTuple):
     meta: dict[str, str] = {}  # noqa: RUF012
 
     def as_json(self) -> dict[str, Any]:
-        """Return the row for a JSON file."""
+        """Return the row as a dictionary for JSON."""
         return {**self._asdict(), "status": self.status.name}
 
 
 @dataclasses.dataclass(frozen=True)
 class Records(Value):
-    """The tensors of jobs [m], job after job, in the object's frame.
+    """The tensors of several jobs, concatenated.
 
-    Letters: p points, j jobs, g grasps, d tries of a grasp in the simulator. An unknown viewpoint is zero. `outcome` is
-    a `Status`.
+    Letters: p points, j jobs, g grasps, d trials of a grasp. A job without a camera has a viewpoint of zeros. `passed`
+    and `outcome` (a `Status`) are for each simulated trial. Lengths are in metres, in the object's frame.
     """
 
     points: Float[Tensor, "p 3"]
@@ -65,13 +65,13 @@ class Records(Value):
 
 
 class Shard(NamedTuple):
-    """The rows of jobs, and their records."""
+    """The rows of several jobs, and their records."""
 
     rows: tuple[JobRow, ...]
     records: Records
 
     def take(self, i: int) -> "Shard":
-        """Return job i alone."""
+        """Return a shard that holds only job i."""
         row, before = self.rows[i], self.rows[:i]
         p, g = sum(x.points for x in before), sum(x.grasps for x in before)
         points, grasps, records = slice(p, p + row.points), slice(g, g + row.grasps), self.records
@@ -80,19 +80,19 @@ class Shard(NamedTuple):
 
 
 def join_shards(parts: Sequence[Shard]) -> Shard:
-    """Return the shard of all jobs of some shards."""
+    """Concatenate the jobs of several shards."""
     records = map_tensors(lambda *tensors: torch.cat(tensors), *(part.records for part in parts))
     return Shard(tuple(itertools.chain(*(part.rows for part in parts))), records)
 
 
 def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
-    """Return the bytes of a shard's file; `meta` names its campaign."""
+    """Return the bytes of a shard's file; `meta` identifies the campaign."""
     jobs = json.dumps([row.as_json() for row in shard.rows])
     return pack_tensors(KIND, named_tensors(shard.records), {**meta, "jobs": jobs})
 
 
 def load_shard(path: Path, meta: dict[str, str]) -> Shard:
-    """Read a shard whose metadata hold `meta`.
+    """Read a shard file; raise an error unless its metadata contains `meta`.
 
     Raises:
         ModelFileError: the file is missing, damaged, or of another campaign.
@@ -138,6 +138,6 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
 
 
 def short(text: str) -> str:
-    """Return a text on one line, cut to the longest text that `read_row` accepts."""
+    """Return a text on one line, cut to the length that readers of rows accept."""
     line = " ".join(text.split())
     return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."

@@ -1,4 +1,4 @@
-"""The library's own objects: meshes, convex parts and noisy views."""
+"""The objects that are shipped with the library: meshes, convex parts and noisy views."""
 
 import dataclasses
 from pathlib import Path
@@ -27,9 +27,10 @@ GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspObject:
-    """A shipped object, z up, resting at z = 0: a closed mesh [m] and its mass [kg].
+    """An object to grasp, in metres, z up, resting at z = 0, with its mass [kg].
 
-    The convex `parts` replace the mesh in simulation. `view` is a noisy cloud from one side, with its viewpoint.
+    `mesh` is the true, closed surface. In simulation the convex `parts`, whose union is the object, are used. `view` is
+    a noisy point cloud from one side, with its viewpoint.
 
     >>> jug = load_object("jug")
     >>> jug.mass, [f"{1000 * side:.0f} mm" for side in jug.mesh.extents], len(jug.parts)
@@ -44,7 +45,7 @@ class GraspObject:
 
 
 def list_objects() -> tuple[str, ...]:
-    """Return the names that `load_object` knows.
+    """Return the names of the shipped objects, for `load_object`.
 
     >>> list_objects()
     ('cylinder', 'jug', 'rabbit', 'spray')
@@ -54,7 +55,7 @@ def list_objects() -> tuple[str, ...]:
 
 @checked
 def load_object(name: str) -> GraspObject:
-    """Return one of the library's objects.
+    """Return a shipped object by name.
 
     Raises:
         BadArgument: no such object.
@@ -72,7 +73,7 @@ def load_object(name: str) -> GraspObject:
 
 @checked
 def load_shipped_grasp(name: str, hand: str) -> Grasps:
-    """Return a shipped grasp of a shipped object.
+    """Return a shipped grasp of a shipped object, to close, draw or export at once.
 
     Args:
         name: "cylinder" or "jug".
@@ -92,7 +93,7 @@ def load_shipped_grasp(name: str, hand: str) -> Grasps:
 
 
 def load_scene() -> Scene:
-    """Return a rendered scene of the library's objects on a table, with noise and true labels; z is up.
+    """Return a rendered scene of the shipped objects on a table, with noise and true labels; z is up.
 
     >>> load_scene().things
     (1, 2, 3, 4)

@@ -1,4 +1,4 @@
-"""Grasps and surfaces in the formats of other programs, written and read."""
+"""Export and import of grasps and surfaces in the formats of other programs."""
 
 from torchgrasp.export.foreign import ForeignGrasps, grasps_from_joints, read_foreign
 from torchgrasp.export.other_formats import (

@@ -1,6 +1,7 @@
-"""Grasps of other planners, and our own JSON, become `Grasps`.
+"""Import of grasps from other planners and from our own JSON, as `Grasps`.
 
-DexGraspBench's .npy is a pickle, which could run code when it is read, so it is refused. Convert a file that you trust:
+DexGraspBench's .npy is a pickle, which could run code when it is read, so it is rejected. Convert a file that you
+trust:
 
     content = numpy.load("0.npy", allow_pickle=1).item()
     numpy.savez("0.npz", grasp_qpos=content["grasp_qpos"], pregrasp_qpos=content["pregrasp_qpos"])
@@ -37,7 +38,7 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """Joints [rad], poses of the hand's root link in the object's frame, and joints of the opened hand if known.
+    """Imported grasps: joints [rad], poses of the hand's root link in the object's frame, pre-grasp if known.
 
     >>> poses = torch.eye(4).double().repeat(5, 1, 1)
     >>> ForeignGrasps(torch.zeros(5, 12).double(), poses, pregrasp=None).joints.shape
@@ -53,7 +54,7 @@ class ForeignGrasps(NamedTuple):
 def read_foreign(
     path: Path | str, hand: Hand, order: Sequence[str] = (), quaternion: Quaternion = "wxyz"
 ) -> ForeignGrasps:
-    """Read joints and poses from the grasps of another program, or from our own JSON.
+    """Read joints and poses of grasps from the file of another program, or from our own JSON.
 
     | file | what is read |
     | --- | --- |
@@ -63,8 +64,8 @@ def read_foreign(
 
     Args:
         path: the file.
-        hand: that grasps. DexGraspBench's frame and order of joints are known of the Allegro hand.
-        order: names of the joints in the file, those of the hand's URDF; joints of other names are left out.
+        hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are known.
+        order: names (as in the hand's URDF) of the joints in the file; other names are ignored.
         quaternion: order of the numbers in a pose, after its position.
 
     Raises:
@@ -98,12 +99,12 @@ def read_foreign(
 
 
 def _refuse(found: str, allowed: str) -> ModelFileError:
-    """Return the error of a file of grasps."""
+    """Return the error for a bad file of grasps."""
     return ModelFileError("path", found, allowed)
 
 
 def _read_own(rows: Field, hand: Hand) -> ForeignGrasps:
-    """Read the rows of `format_grasps`."""
+    """Read grasps in the JSON format of `format_grasps`."""
     joints, opened, poses = list[list[float]](), list[list[float]](), list[list[float]]()
     for row in rows.items(MOST_GRASPS):
         fields = row.entries()
@@ -122,19 +123,19 @@ def _read_own(rows: Field, hand: Hand) -> ForeignGrasps:
 
 
 def _entry(fields: dict[str, Field], name: str, row: Field) -> Field:
-    """Return a field of a row that must be there."""
+    """Return a required field of a row; raise `ModelFileError` if it is missing."""
     if name not in fields:
         raise _refuse(f"{row.path}: {row.place} without {name!r}", f"a field {name!r}")
     return fields[name]
 
 
 def _table(field: Field, width: int) -> np.ndarray:
-    """Return a list of lists of so many numbers."""
+    """Return a field as an array (n, width); raise an error for anything but a list of lists of numbers."""
     return np.array([row.numbers(width, -FAR, FAR) for row in field.items(MOST_GRASPS)]).reshape(-1, width)
 
 
 def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion) -> ForeignGrasps:
-    """Read an .npz with DexGraspBench's names; a file holds one grasp or rows of them."""
+    """Read an .npz in DexGraspBench's format, with one grasp or rows of grasps."""
     turn, known = BENCH_HANDS.get(hand.name, ([1.0, 0.0, 0.0, 0.0], ()))
     order = order or tuple(known)
     places, width = _places(hand, order), 7 + len(order)
@@ -166,7 +167,7 @@ def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quat
 
 
 def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
-    """Return where a file's order has each actuated joint."""
+    """Return the position of each actuated joint in a file's joint order."""
     missing = [name for name in hand.joint_names if name not in order]
     if missing or len(set(order)) != len(order):
         found = f"{len(order)} names without {', '.join(missing[:4])}" if missing else "a name twice"
@@ -175,7 +176,7 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
 
 
 def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
-    """Return poses from positions and quaternions."""
+    """Return pose matrices from positions and quaternions (g, 7)."""
     tolerance = 1e-3  # largest difference from 1 of a quaternion's length in a file of few digits
     from scipy.spatial.transform import Rotation
 
@@ -199,20 +200,20 @@ def grasps_from_joints(
     spec: ContactSpec | None = None,
     std_m: Length | None = None,
 ) -> Grasps:
-    """Return grasps of any origin as `Grasps`, so that `certify`, `close_hand`, `evaluate` and the exports take them.
+    """Return imported joints and poses as `Grasps`, for `certify`, `close_hand`, `evaluate` and the exporters.
 
-    Contacts are where the pads' middles are, with normals against the pads. Certificates are of these contacts; a row
-    that is not closed gets `Status.NOT_CLOSED`. Who knows the surface replaces both by its points and normals.
-    `clearance` is that of the links from each other, since no object is known. `score` is 0: nothing is predicted. The
-    hand comes along its own approach.
+    Contacts are at the middle of each pad, with normals opposite to the pads'. Certificates are for these contacts; a
+    grasp that is not closed gets `Status.NOT_CLOSED`. Replace contacts and certificate if you know the surface.
+    `clearance` is that of self-collision, because no object is known. `score` is 0: nothing is predicted. The approach
+    is the hand's own approach axis.
 
     Args:
-        hand: that grasps.
+        hand: the grasping hand.
         joints: actuated joints [rad], in the order of `hand.joint_names`.
         obj_from_hand: poses of the root link of the hand's URDF.
-        pregrasp: joints of the opened hand; None: each tip 20 mm off its contact, or as far as limits allow.
+        pregrasp: joints of the opened hand; None: each tip is moved 20 mm off its contact, or as far as limits allow.
         spec: friction and edges of the certificate; `ContactSpec()` by default.
-        std_m: standard deviation [m] of the surface at each contact that a closing under uncertainty shall assume.
+        std_m: standard deviation [m] of the surface at each contact, for closing controllers that use it.
 
     Raises:
         BadArgument: wrong shapes, joints outside the limits, poses that are not rigid.
@@ -256,7 +257,7 @@ def grasps_from_joints(
 
 
 def _open(hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]) -> Float[Tensor, "g h"]:
-    """Return joints whose fingertips stand off along the contacts' normals, within the limits."""
+    """Return joints at which the fingertips are moved off their contacts along the normals, within the limits."""
     # How far [m] fingertips stand off where no pre-grasp is given, and in how many linear steps: within 1 mm
     opening, steps = 0.02, 4
     for _ in range(steps):

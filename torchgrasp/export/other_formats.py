@@ -1,4 +1,4 @@
-"""Files for other programs: grasps for DexGraspBench's evaluator and GraspGen's loader, and the surface as a mesh.
+"""Export of grasps for DexGraspBench's evaluator and GraspGen's loader, and of the surface as a mesh.
 
 DexGraspBench reads each grasp by NumPy's `load` with pickles allowed. The format exists only as a pickle, and
 `save_dexgraspbench` is the one function of torchgrasp that writes one. No function of torchgrasp reads a pickle.
@@ -36,22 +36,22 @@ def save_dexgraspbench(
     force: Annotated[float, Range(0.01, 100.0)] = 4.0,
     kp: Positive = 5.0,
 ) -> list[Path]:
-    """Write one file for each grasp, `folder/0.npy` and so on, which DexGraspBench's evaluator reads.
+    """Write each grasp as a file `folder/0.npy`, `folder/1.npy` and so on, for DexGraspBench's evaluator.
 
     A file is a dictionary: `obj_path`, `obj_scale` (1), `obj_pose` (none), and `pregrasp_qpos`, `grasp_qpos`,
-    `squeeze_qpos` (23): position [m] and quaternion (w, x, y, z) of the hand, then 16 joints [rad]. The evaluator
-    accepts nothing but a pickled dictionary; it holds arrays, numbers and a text alone.
+    `squeeze_qpos` (23): position [m] and quaternion (w, x, y, z) of the hand, then 16 joints [rad]. The evaluator only
+    accepts a pickled dictionary; ours holds only arrays, numbers and a text.
 
     Args:
         hand: the Allegro hand, whose model the bench has.
-        grasps: planned for it.
-        folder: below the bench's `output/NAME_allegro/graspdata/OBJECT`.
-        object_path: folder of the object as the bench has it (`assets/...`), with the frame of the planned cloud.
+        grasps: grasps planned for this hand.
+        folder: folder to write, in the bench `output/NAME_allegro/graspdata/OBJECT`.
+        object_path: the object's folder in the bench (`assets/...`); its frame must be that of the planned cloud.
         force: normal force of the strongest finger [N].
         kp: stiffness of the bench's drives [N m/rad].
 
     Raises:
-        BadArgument: a hand that the bench does not have in these frames, or joints of another hand.
+        BadArgument: a hand that is not in the bench, or joints of another hand.
         OutputError: the folder cannot be written.
 
     >>> import tempfile
@@ -91,8 +91,9 @@ def save_dexgraspbench(
 def format_graspgen(grasps: Grasps, object_path: str) -> str:
     """Return grasps as the JSON of a GraspGen data set: poses of the hand's root link in the object's frame.
 
-    `object_in_gripper` tells which are executable. The fields `success` (predicted), `joints` and `joint_names` are
-    ours. `object_path` is that of the mesh in the data set, with the frame of the planned cloud and scale 1.
+    `object_in_gripper` says which grasps are executable. The fields `success` (predicted), `joints` and `joint_names`
+    are our additions. `object_path` is the path of the mesh in the data set; its frame is that of the planned cloud,
+    its scale 1.
 
     >>> import json
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -110,7 +111,7 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
 
 def rotation_of(wxyz: list[float]) -> torch.Tensor:
-    """Return the matrix of a quaternion of any length."""
+    """Return the rotation matrix of a quaternion (w, x, y, z) of any length."""
     from scipy.spatial.transform import Rotation
 
     w, x, y, z = wxyz
@@ -119,7 +120,9 @@ def rotation_of(wxyz: list[float]) -> torch.Tensor:
 
 @checked
 def save_surface(surface: Surface, path: Path | str) -> Path:
-    """Write a surface as `.ply`, with `std_m` [m] of each vertex, or `.glb`. Yellow marks `largest_std`, violet 0.
+    """Write a surface with its uncertainty as colours to `.ply` (with `std_m` [m] of each vertex) or `.glb`.
+
+    Yellow marks a standard deviation of `largest_std`, violet 0.
 
     Raises:
         BadArgument: another suffix.
@@ -155,7 +158,7 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 
 @checked
 def largest_std(surface: Surface) -> float:
-    """Return the upper end [m] of the colour scale: the 99 % quantile over the vertices, at least 1 um.
+    """Return the largest standard deviation [m] of the colour scale: the 99 % quantile over the vertices.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import extract_surface
@@ -168,7 +171,7 @@ def largest_std(surface: Surface) -> float:
 
 @checked
 def check_surface_path(path: Path | str) -> Path:
-    """Return the path if `save_surface` can write its format; raise `BadArgument` for another suffix.
+    """Return the path if `save_surface` can write its format; raise `BadArgument` for other suffixes.
 
     >>> check_surface_path("a.glb").suffix
     '.glb'

@@ -1,4 +1,4 @@
-"""Grasps as postures of named joints: plain JSON, and keyframes of a MuJoCo model."""
+"""Export of grasps as postures of named joints: plain JSON, and keyframes of a MuJoCo model."""
 
 import xml.etree.ElementTree as ET
 from typing import Annotated
@@ -38,11 +38,11 @@ CONVENTIONS = {
 def format_grasps(
     hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
 ) -> str:
-    """Return grasps as JSON, with `CONVENTIONS`.
+    """Return grasps as JSON, together with `CONVENTIONS`, which explain the numbers.
 
-    The hand comes to "pose" along "approach" in its "pregrasp" posture. It closes to "grasp" in the time given.
-    In the same time again it presses towards "squeeze". All joints move evenly. The strongest finger presses with a
-    normal force of `force` [N]. `kp` is the stiffness of the robot's own position control [N m/rad]; None: the hand's.
+    The hand moves along "approach" to "pose" in its "pregrasp" posture. It closes to "grasp" in the given time, and in
+    the same time again it presses towards "squeeze". All joints move evenly. The strongest finger presses with a normal
+    force of `force` [N]. `kp` is the stiffness of the robot's own position control [N m/rad]; None: the hand's.
 
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
@@ -113,7 +113,7 @@ def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:
 def format_keyframes(
     hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
 ) -> str:
-    """Return MJCF of the hand with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
+    """Return the hand as MJCF with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
 
     The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl` is the targets of
     the actuators. The text elements "qpos" and "ctrl" name their order. The approach has the joints of the pre-grasp.

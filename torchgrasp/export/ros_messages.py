@@ -1,4 +1,4 @@
-"""Grasps as ROS 2 messages in YAML: moveit_msgs/Grasp and trajectory_msgs/JointTrajectory."""
+"""Export of grasps as ROS 2 messages in YAML: moveit_msgs/Grasp and trajectory_msgs/JointTrajectory."""
 
 import math
 from collections.abc import Iterator
@@ -24,13 +24,13 @@ OBJECT_FRAME = "object"
 def format_moveit(
     hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
 ) -> str:
-    """Return a YAML list of moveit_msgs/Grasp.
+    """Return grasps as a YAML list of moveit_msgs/Grasp.
 
     `grasp_pose` is that of the root link of the hand's URDF in `OBJECT_FRAME`: attach the end-effector there. The
     pre-grasp posture has positions; the grasp posture closes to the contacts, then to targets that press, with the
-    torques [N m] as effort. `grasp_quality` is the predicted success. The retreat goes back as the hand came.
-    `force` [N] is the normal force of the strongest finger. `kp` is the stiffness of the robot's own position control
-    [N m/rad]; None: the hand's.
+    torques [N m] as effort. `grasp_quality` is the predicted success. The retreat is opposite to the approach. `force`
+    [N] is the normal force of the strongest finger. `kp` is the stiffness of the robot's own position control [N
+    m/rad]; None: the hand's.
 
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
@@ -65,7 +65,7 @@ def format_trajectories(
 ) -> str:
     """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp: pre-grasp, grasp, squeeze.
 
-    The hand stands at its pose already; `format_moveit` and `format_grasps` say where. Arguments and errors are those
+    The hand must already be at its pose, which `format_moveit` and `format_grasps` give. Arguments and errors are those
     of `format_moveit`.
 
     >>> from torchgrasp import load_hand
@@ -117,14 +117,14 @@ def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
 
 
 def _translation(direction: Float[Tensor, "3"]) -> dict[str, Any]:
-    """Return a moveit_msgs/GripperTranslation by the approach's distance."""
+    """Return a moveit_msgs/GripperTranslation along a direction, as long as the approach."""
     vector = dict(zip("xyz", direction.tolist(), strict=True))
     stamped = {"header": {"frame_id": OBJECT_FRAME}, "vector": vector}
     return {"direction": stamped, "desired_distance": APPROACH_DISTANCE, "min_distance": APPROACH_DISTANCE}
 
 
 def _heading(hand: Hand, root: str, what: str) -> str:
-    """Return comments that say what the numbers mean."""
+    """Return comment lines that explain the numbers."""
     return (
         f"# {what}, for the {hand.name} hand, by torchgrasp\n"
         f"# metres, radians, newtons, N m; quaternions by name; frame {OBJECT_FRAME!r}: that of the planned cloud\n"
@@ -133,12 +133,12 @@ def _heading(hand: Hand, root: str, what: str) -> str:
 
 
 def _document(value: Any) -> str:
-    """Return plain values as a YAML document in block style; empty lists and lists of scalars stand in one line."""
+    """Return plain values as a YAML document in block style; lists of scalars take one line."""
     return "\n".join(_lines(value)) + "\n"
 
 
 def _lines(value: Any) -> list[str]:
-    """Return the lines of a mapping, or of a list of mappings."""
+    """Return the YAML lines of a mapping, or of a list of mappings."""
     lines = list[str]()
     if isinstance(value, dict):
         for key, item in value.items():
@@ -152,7 +152,7 @@ def _lines(value: Any) -> list[str]:
 
 
 def _scalar(value: Any) -> str:
-    """Return a scalar, or a list of them, in one line."""
+    """Return a scalar, or a list of scalars, as YAML on one line."""
     digits = 9  # decimals of a number [nm, nrad]: YAML 1.1 takes 1e-05 for a text, so none has an exponent
     if isinstance(value, list):
         return f"[{', '.join(map(_scalar, value))}]"

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, in locked folders, and read within limits. Not public.
+"""Files: written completely or not at all, in locked folders, and read within limits.
 
 No file is pickled: a file from a stranger may be malformed, but it cannot run code.
 """

@@ -1,4 +1,4 @@
-"""JSON and TOML files within limits, read field by field with the type of each field.
+"""Reading of JSON and TOML files within limits, field by field, with checks of types and ranges.
 
 An error names the file and the field, such as `objects.cup.views.front`.
 """
@@ -14,7 +14,7 @@ from torchgrasp.limits import JSON_BYTES, JSON_LETTERS, SHOWN_LETTERS
 
 
 class Field(NamedTuple):
-    """A value in a file with its place; `refuse` makes its error."""
+    """A value in a JSON or TOML file, with its path and place in the file; `refuse` makes the error for a bad value."""
 
     path: Path
     place: str
@@ -22,7 +22,7 @@ class Field(NamedTuple):
     refuse: Refuse
 
     def wrong(self, allowed: str) -> BadArgument:
-        """Return the error of this field."""
+        """Return the error for a bad value of this field; `allowed` says what is expected."""
         try:
             text = repr(self.value)[: SHOWN_LETTERS + 1]
         except ValueError:  # Python writes no whole number of more than 4300 digits
@@ -31,7 +31,7 @@ class Field(NamedTuple):
         return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
 
     def entries(self) -> "dict[str, Field]":
-        """Return the fields of an object by name."""
+        """Return the fields of a JSON object by name."""
         if not isinstance(self.value, dict):
             raise self.wrong("an object { }")
         within = f"{self.place}." if self.place else ""
@@ -44,35 +44,35 @@ class Field(NamedTuple):
         return [Field(self.path, f"{self.place}[{i}]", x, self.refuse) for i, x in enumerate(self.value)]
 
     def text(self, most: int = JSON_LETTERS) -> str:
-        """Return a text of at most `most` letters."""
+        """Return the value as a text of at most `most` letters."""
         if not isinstance(self.value, str) or len(self.value) > most:
             raise self.wrong(f"a text of at most {most} letters")
         return self.value
 
     def number(self, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> float:
-        """Return a number in [low, high]; by default any finite number."""
+        """Return the value as a number in [low, high]; by default any finite number."""
         number = self.value
         if isinstance(number, bool) or not isinstance(number, int | float) or not low <= number <= high:
             raise self.wrong("a finite number" if high == sys.float_info.max else f"a number in [{low:g}, {high:g}]")
         return float(number)
 
     def numbers(self, count: int, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> list[float]:
-        """Return a list of `count` numbers in [low, high]."""
+        """Return the value as a list of `count` numbers in [low, high]."""
         if not isinstance(self.value, list) or len(self.value) != count:
             raise self.wrong(f"{count} numbers")
         return [x.number(low, high) for x in self.items(count)]
 
     def whole(self, low: int, high: int) -> int:
-        """Return a whole number in [low, high]."""
+        """Return the value as a whole number in [low, high]."""
         if isinstance(self.value, bool) or not isinstance(self.value, int) or not low <= self.value <= high:
             raise self.wrong(f"a whole number in [{low}, {high}]")
         return self.value
 
 
 def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) -> Field:
-    """Read a JSON file in UTF-8 of at most `most` bytes; raise the error of `refuse` for any other file.
+    """Read a JSON file in UTF-8 of at most `most` bytes; raise the error that `refuse` makes for any other file.
 
-    NaN and Infinity are no JSON, and no number of more than 4300 digits is read.
+    NaN and Infinity are not valid JSON, and no number of more than 4300 digits is read.
     """
     if not is_file(path):  # a pipe or a device would block, or never end
         raise refuse(f"{path}, which is no file", allowed)
@@ -86,5 +86,5 @@ def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) 
 
 
 def _refuse_constant(name: str) -> float:
-    """Refuse NaN and Infinity, which Python would read."""
+    """Raise an error for NaN and Infinity, which Python's reader would accept."""
     raise ValueError(f"{name}, which is no JSON")

@@ -1,4 +1,4 @@
-"""Values and tensors, with metadata, as one safetensors file that is checked when it is read."""
+"""Values and tensors with metadata as a safetensors file, which is checked when it is read."""
 
 import dataclasses
 import json
@@ -38,7 +38,7 @@ def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: 
 
 
 def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> bytes:
-    """Return the bytes of such a file; equal values give equal bytes."""
+    """Return the bytes of a safetensors file of a `kind`; equal tensors and metadata give equal bytes."""
     contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}  # a file shares no memory
     # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
     header = {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)}
@@ -48,7 +48,7 @@ def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) ->
 def load_tensors(
     path: Path | str, kind: str, names: set[str], optional: Collection[str] = ()
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a safetensors file of a `kind` that holds the tensors `names`, and of others at most the `optional`.
+    """Read a safetensors file of a `kind` with the tensors `names`, and possibly some of `optional`.
 
     Raises:
         ModelFileError: the file is missing, malformed or larger than `TENSOR_FILE_BYTES`, has another kind, version or
@@ -86,16 +86,16 @@ def load_tensors(
 
 
 def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) -> tuple[SomeValue, dict[str, str]]:
-    """Read a value that `save_tensors` wrote under the names of its fields, and the metadata.
+    """Read a value from a safetensors file in which each tensor has the name of its field, and the metadata.
 
-    The annotations of its fields say which tensors there are, which may be missing, and their shapes. A letter in them
-    has one size in all fields.
+    The annotations of the fields give the tensors, whether they are optional, and their shapes. A letter in the shapes
+    has the same size in all fields.
 
     Args:
-        path: of the file.
-        kind: of the file, such as "grasps".
-        of: class of the value.
-        rest: fields that are no tensors; others keep their defaults.
+        path: the file.
+        kind: kind of the file, such as "grasps".
+        of: class of the value to return.
+        rest: values of fields that are not tensors; other such fields keep their defaults.
 
     Raises:
         ModelFileError: a file as in `load_tensors`, or a tensor of another shape or type.
@@ -112,7 +112,7 @@ def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) ->
 
 
 def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ...]]:
-    """Return the annotation of each tensor inside a value by its dotted name; with NoneType if it may be missing."""
+    """Return the annotations of all tensors in a value class by dotted name; optional tensors include NoneType."""
     fields: dict[str, tuple[Any, ...]] = {}
     for name, hint in _hints(of).items():
         kinds = typing.get_args(hint) if typing.get_origin(hint) not in (None, dict) else (hint,)
@@ -124,7 +124,7 @@ def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ..
 
 
 def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: dict[str, Any]) -> SomeValue:
-    """Return a value of tensors by dotted name; a missing one is None."""
+    """Return a value built from tensors by dotted name; a missing tensor becomes None."""
     values: dict[str, Any] = dict(rest)
     own = _tensor_fields(of)
     for name, hint in _hints(of).items():
@@ -136,25 +136,25 @@ def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: d
 
 
 def _hints(of: type[Value]) -> dict[str, Any]:
-    """Return the types of a dataclass's fields."""
+    """Return the type annotations of a dataclass's fields."""
     hints = typing.get_type_hints(of)
     return {field.name: hints[field.name] for field in dataclasses.fields(of)}  # pyright: ignore[reportArgumentType]
 
 
 def _is_value(hint: Any) -> bool:
-    """Return whether an annotation is that of a value."""
+    """Return whether an annotation is a subclass of `Value`."""
     return typing.get_origin(hint) is None and isinstance(hint, type) and issubclass(hint, Value)
 
 
 class Recent(Generic[Item]):
-    """Keeps the last few items that were read, by number; a copy in another process begins empty."""
+    """A cache of the last few items read, by number; a copy in another process starts empty."""
 
     def __init__(self, most: int) -> None:
         self.most = most
         self.kept: dict[int, Item] = {}
 
     def get(self, number: int, read: Callable[[int], Item]) -> Item:
-        """Return the item of a number, read if it is not kept."""
+        """Return an item by number; read it if it is not in the cache."""
         item = self.kept.pop(number, None)
         item = read(number) if item is None else item
         self.kept[number] = item  # now the last one

@@ -1,4 +1,4 @@
-"""Files are written under another name, flushed and moved into place; folders are locked against other runs."""
+"""Atomic writing of files (written under another name, then moved into place), and locks on folders and files."""
 
 import contextlib
 import hashlib
@@ -24,11 +24,11 @@ LOCK = ".lock"  # name of the lock file in a folder. It holds the process and ho
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
-    """Write a file, text as UTF-8. Readers find the old content or the new one, whatever happens.
+    """Write a file atomically, text as UTF-8: readers find either the old content or the new one.
 
     Args:
-        path: of the file; its folder is made.
-        content: or a function that writes the content into the file object that it gets.
+        path: path of the file; its folder is created.
+        content: the content, or a function that writes the content into a given file object.
 
     Raises:
         OutputError: the folder cannot be written, or the disk is full. Nothing half-written is left.
@@ -67,7 +67,7 @@ def remove_file(path: Path) -> None:
 
 
 def is_file(path: Path | str) -> bool:
-    """Return whether a path is that of a regular file; a path of a wrong type or length is not."""
+    """Return whether a path is a regular file; False for a path of a wrong type or length."""
     try:
         return Path(path).is_file()
     except (OSError, TypeError, ValueError):
@@ -75,13 +75,13 @@ def is_file(path: Path | str) -> bool:
 
 
 def read_bytes(path: Path | str) -> bytes:
-    """Return the content of a file up to the size that it reports: some files of the system never end."""
+    """Return the content of a file, at most as many bytes as its reported size: some system files never end."""
     with Path(path).open("rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> bytes:
-    """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for any other."""
+    """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for others."""
     if not is_file(path):
         raise refuse(f"{path}, which is no file", allowed)
     if (size := Path(path).stat().st_size) > most:
@@ -95,12 +95,12 @@ def sha256(path: Path | str) -> str:
 
 
 def format_json(value: Any) -> str:
-    """Return a value as JSON; a status becomes its name, NaN and infinity become null."""
+    """Return a value as JSON text; a status becomes its name, NaN and infinity become null."""
     return json.dumps(_plain(value), indent=1)
 
 
 def _plain(value: Any) -> Any:
-    """Replace statuses, NaN and infinity, which JSON does not have."""
+    """Replace statuses by their names, and NaN and infinity by None, for JSON."""
     if isinstance(value, dict):
         return {key: _plain(x) for key, x in value.items()}
     if isinstance(value, list | tuple):
@@ -111,21 +111,21 @@ def _plain(value: Any) -> Any:
 
 
 def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) -> str:
-    """Return rows as lines of text; columns are flush right except those in `left`."""
+    """Return rows of cells as aligned lines of text; columns are right-aligned except those in `left`."""
     longest = [max(map(len, column)) for column in zip(*rows, strict=True)]
     widths = [-width if k in left else width for k, width in enumerate(longest)]
     return "\n".join(format_line(row, widths) for row in rows)
 
 
 def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
-    """Return one row as a line of text; a column of negative width is flush left."""
+    """Return one row of cells as a line of text; a column of negative width is left-aligned."""
     columns = zip(cells, widths, strict=True)
     return "  ".join(f"{cell!s:{'<' if w < 0 else '>'}{abs(w)}}" for cell, w in columns).rstrip()
 
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and lock it against other runs; remove what a killed run left half-written in it.
+    """Create a folder and lock it against other runs; remove half-written files of an interrupted run.
 
     A new folder that is still empty at the end is removed.
 
@@ -139,7 +139,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[None]:
-    """Lock a file against other runs by a lock file beside it; remove what a killed run left of it half-written.
+    """Lock a file against other runs, by a lock file beside it; remove half-written files of an interrupted run.
 
     Raises:
         OutputError: another run holds the lock, or the file's folder cannot be written.
@@ -150,7 +150,7 @@ def hold_file(path: Path) -> Iterator[None]:
 
 
 def begin_folder(path: Path, content: str, what: str) -> None:
-    """Begin a held folder with the file that describes it, or check that it began with the same file.
+    """Write the file that describes a locked folder, or check that the folder already has the same file.
 
     Raises:
         OutputError: the folder holds other content of the kind `what`, or other files.
@@ -167,14 +167,14 @@ def begin_folder(path: Path, content: str, what: str) -> None:
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Make a folder among the system's temporary ones, and remove it at the end."""
+    """Create a temporary folder, and remove it at the end of the context."""
     with tempfile.TemporaryDirectory(prefix="torchgrasp-", ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
 
 @contextlib.contextmanager
 def _hold(argument: str, what: Path, path: Path) -> Iterator[None]:
-    """Lock a folder or a file by a lock file at a path."""
+    """Lock a folder or a file by means of a lock file at `path`."""
     folder = path.parent
     made = [x for x in (folder, *folder.parents) if not x.exists()]
     lock = FileLock(path, timeout=0)
@@ -202,7 +202,7 @@ def _hold(argument: str, what: Path, path: Path) -> Iterator[None]:
 
 
 def _holder(path: Path) -> str:
-    """Return the run that holds a lock, as its file says."""
+    """Return which run holds a lock, as written in its lock file."""
     try:
         return path.read_text(encoding="utf-8")[:200].strip() or "another run"
     except (OSError, UnicodeDecodeError):
@@ -210,7 +210,7 @@ def _holder(path: Path) -> str:
 
 
 def _remove_parts(paths: Iterator[Path]) -> None:
-    """Remove half-written files that a killed run left; the lock says that no run is writing them."""
+    """Remove half-written files of an interrupted run; the lock ensures that no run is writing them."""
     for part in list(paths):
         with contextlib.suppress(OSError):
             part.unlink()
