@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 NOISE, NOISE_GROWTH = 0.001, 0.0035
@@ -58,14 +58,15 @@ def fit_planes(view: View, generator: torch.Generator) -> Iterator[PlaneFit]:
     points, noise = view.points[:scored], view.noise[:scored]
     normals, offsets = _propose(view, scored, generator)
     held = _held(points, noise, normals, offsets)
-    for _ in range(8):
-        counts = held.sum(-1)
-        i = int(counts.argmax()) if len(counts) else 0
-        if not len(counts) or int(counts[i]) < 0.5 * LEAST_SHARE * len(points):
+    left = torch.ones(len(points))
+    for _ in range(8 if len(held) else 0):
+        counts = held @ left
+        i = int(counts.argmax())
+        if int(counts[i]) < 0.5 * LEAST_SHARE * len(points):
             break
         fit = _refine(view, normals[i], float(offsets[i]))
         yield fit
-        held = held & ((points @ fit.normal - fit.offset).abs() > 3 * noise) & ~held[i]
+        left = left * ((points @ fit.normal - fit.offset).abs() > 3 * noise) * (1 - held[i])
 
 
 def _propose(view: View, scored: int, generator: torch.Generator) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
@@ -92,11 +93,11 @@ def _propose(view: View, scored: int, generator: torch.Generator) -> tuple[Float
 
 def _held(
     points: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normals: Float[Tensor, "m 3"], offsets: Float[Tensor, "m"]
-) -> Bool[Tensor, "m n"]:
-    """Return which points are within twice the noise of each plane."""
-    held = torch.empty(len(normals), len(points), dtype=torch.bool)
+) -> Float[Tensor, "m n"]:
+    """Return 1 where a point is within twice the noise of a plane, else 0."""
+    held = torch.empty(len(normals), len(points))
     for rows in torch.arange(len(normals)).split(500):
-        held[rows] = (normals[rows] @ points.T - offsets[rows, None]).abs_() < 2 * noise
+        held[rows] = ((normals[rows] @ points.T - offsets[rows, None]).abs_() < 2 * noise).float()
     return held
 
 

@@ -41,8 +41,9 @@ class Support:
         """Return which points are over the region or at most `margin` [m] beside it; a negative margin shrinks it."""
         if self.sides is None:
             return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
-        sides = self.sides.to(points)
-        return (points @ sides[:, :3].T + sides[:, 3] < margin).all(-1)
+        sides, rows = self.sides.to(points), points.reshape(-1, 3).split(10_000)  # parts that a cache holds
+        parts = [(sides[:, :3] @ part.T + sides[:, 3:]).amax(0) < margin for part in rows]
+        return torch.cat(parts).reshape(points.shape[:-1])
 
     def moved(self, shift: Float[Tensor, "3"]) -> "Support":
         """Return the support after a translation [m]."""

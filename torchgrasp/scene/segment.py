@@ -40,7 +40,8 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     table, points = support.plane, image.points()
     measured, smooth = image.depth > 0, image.without_speckle()
     mean, threshold = _smoothed(image, table)
-    risen = _risen(smooth, table, mean, threshold) & support.covers(points, OVERHANG)
+    risen = _risen(smooth, table, mean, threshold)
+    risen[risen.clone()] = support.covers(points[risen], OVERHANG)
     core, jump = _core(smooth, risen)
     pieces = _grown(points, _components(core, smooth.depth, jump), risen)
     thin = _components(risen & (pieces == 0), smooth.depth, jump)
@@ -49,7 +50,8 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     # A tenth of an object's pixels are 3.5 mm high; an uneven table is not.
     high = _counts(torch.where(mean > 0.0035, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
     few = _counts(torch.where(sure, pieces, 0), len(high)) < FEW
-    beside = _counts(torch.where(support.covers(points), pieces, 0), len(high)) < 0.2 * _counts(pieces)
+    over = pieces[pieces > 0][support.covers(points[pieces > 0])]
+    beside = _counts(over, len(high)) < 0.2 * _counts(pieces)
     pieces = torch.where((few | ~high | beside)[pieces], 0, pieces)
     group = _merge(smooth, torch.where(sure, pieces, 0), table, jump)
     return _numbered(_filled(group[pieces], measured, table.height(points)))
