@@ -1,4 +1,4 @@
-"""The base of all values: frozen dataclasses of tensors, and batches with rows."""
+"""The base classes of all values: frozen dataclasses of tensors, and batches of them."""
 
 import dataclasses
 import functools
@@ -21,9 +21,9 @@ SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
 def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
-    """Return a value whose tensors are `function` of the tensors in the same field of every value.
+    """Apply a function to the tensors in the same field of several values; return the value of the results.
 
-    Nested values are mapped in the same way. Fields without tensors are those of the first value.
+    Nested values are mapped in the same way. Other fields are taken from the first value.
 
     Raises:
         BadArgument: a field holds a tensor in one value and None in another.
@@ -48,28 +48,27 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
 
 @functools.cache
 def _names(kind: type) -> tuple[str, ...]:
-    """Return the names of the fields of a kind of value."""
+    """Return the field names of a value class."""
     return tuple(f.name for f in dataclasses.fields(kind))
 
 
 class Value:
-    """Base of all values: `.to()` maps every tensor inside, nested values included, into a new value."""
+    """Base of all values: a frozen dataclass of tensors, which `.to()` moves to a device or dtype as a new value."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Give each class the short text of `Value` instead of every number."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):
             cls.__repr__ = Value.__repr__
 
     def __repr__(self) -> str:
-        """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small ones."""
+        """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small tensors."""
         fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
         parts = [f"{f.name}={_short(getattr(self, f.name))}" for f in fields]
         lines = textwrap.wrap(f"{type(self).__name__}({', '.join(parts)})", 110, subsequent_indent="    ")
         return "\n".join(lines if len(lines) <= 12 else [*lines[:11], "    ...)"])
 
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
-        """Return the value on another device or in another floating dtype; integers keep theirs.
+        """Return the value on another device or in another floating dtype; integer tensors keep their dtype.
 
         Raises:
             BadArgument: the device does not exist, or the dtype is neither float32 nor float64.
@@ -84,7 +83,7 @@ class Value:
 
 
 def _short(value: Any) -> str:
-    """Return a field of a value as a short text."""
+    """Return a short text for one field of a value."""
     if isinstance(value, Tensor):
         if value.numel() <= 4 and value.device.type == "cpu":
             return _digits(value.tolist())
@@ -96,21 +95,21 @@ def _short(value: Any) -> str:
 
 
 def _digits(value: Any) -> str:
-    """Return a number, or nested lists of numbers, with five digits."""
+    """Return a number, or nested lists of numbers, as text with five digits."""
     if isinstance(value, list):
         return f"[{', '.join(map(_digits, value))}]"
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 class Batch(Value):
-    """A value whose tensors share a leading batch axis: indexing selects rows, `len` counts them."""
+    """A value whose tensors share a leading batch axis: indexing selects rows, `len` gives their number."""
 
     def __len__(self) -> int:
-        """Count the rows."""
+        """Return the number of rows."""
         return len(getattr(self, dataclasses.fields(self)[0].name))  # pyright: ignore[reportArgumentType]
 
     def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:
-        """Select rows by a slice, a mask or indices. A single index of any kind keeps the batch axis.
+        """Return the rows at a slice, a mask or indices. A single index also keeps the batch axis.
 
         Raises:
             BadArgument: a single boolean, or no index at all.
@@ -168,12 +167,12 @@ def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch
 
 
 def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
-    """Return a batch whose rows `at` are those of `part`."""
+    """Return a batch with the rows `at` replaced by those of `part`."""
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
 def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
-    """Evaluate a function of the leading axis in chunks of bounded memory."""
+    """Evaluate a function of the leading axis in chunks of `size` rows, which bounds the memory."""
     if len(x) <= size:
         return evaluate(x)
     whole: tuple[Any, ...] = ()
@@ -186,7 +185,7 @@ def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: in
 
 
 def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
-    """Return every tensor inside a value by its dotted field name."""
+    """Return all tensors in a value by their dotted field names."""
     tensors: dict[str, Tensor] = {}
     for field in dataclasses.fields(value):  # pyright: ignore[reportArgumentType]
         inner = getattr(value, field.name)
@@ -198,35 +197,35 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
 
 
 def settle(value: SomeValue, device: torch.device) -> SomeValue:
-    """Return a value on a device; a value that is there already is returned itself, with its caches."""
+    """Return a value on a device; if it is already there the value itself, with its caches."""
     return value if all(x.device == device for x in named_tensors(value).values()) else value.to(device)
 
 
 def check_device(name: str, found: torch.device, beside: str, wanted: torch.device) -> None:
-    """Refuse an argument on another device than the one `beside` it; raise `BadArgument`."""
+    """Raise `BadArgument` unless an argument is on the same device as the one `beside` it."""
     if found != wanted:
         raise BadArgument(name, f"tensors on {found}", f"tensors on {wanted}, as {beside}: `.to` moves them")
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Count the rows of each status, the most frequent first."""
+    """Return how many rows have each status, the most frequent first."""
     codes, counts = torch.unique(status, return_counts=True)
     pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))
     return {Status(code): count for code, count in pairs}
 
 
 def check_whole(name: str, value: Any, low: int, high: int) -> None:
-    """Refuse a number that is not whole or is out of range; raise `BadArgument`."""
+    """Raise `BadArgument` unless a value is a whole number in [low, high]."""
     if not _is_number(value) or not low <= value <= high or value != int(value):
         raise BadArgument(name, value if _is_number(value) else repr(value), f"a whole number in [{low}, {high}]")
 
 
 def check_number(name: str, value: Any, low: int | float, high: int | float) -> None:
-    """Refuse a number that is out of range or NaN; raise `BadArgument`."""
+    """Raise `BadArgument` unless a value is a number in [low, high]."""
     if not _is_number(value) or not low <= value <= high:
         raise BadArgument(name, value if _is_number(value) else repr(value), f"a number in [{low:g}, {high:g}]")
 
 
 def _is_number(value: Any) -> bool:
-    """Tell whether a value is a real number; True and False are none."""
+    """Return whether a value is a real number; True and False are not."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool)

@@ -40,7 +40,7 @@ _thread = threading.local()  # `inside` is True while this thread is in a checke
 
 @dataclasses.dataclass
 class _Call:
-    """One checked call. `deep` checks the fields of values again, `strict` ignores `ANY`; `sizes` are of letters."""
+    """The state of checking one call: options, and the sizes of shape letters found so far."""
 
     gradients: bool
     deep: bool = True
@@ -50,7 +50,7 @@ class _Call:
     rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
 
     def check_numbers(self) -> None:
-        """Refuse NaN, infinity and transforms that are not rigid."""
+        """Raise `BadArgument` for NaN, infinity, and transforms that are not rigid."""
         for tensors, test, allowed in (
             (self.finite, torch.isfinite, "finite numbers"),
             (self.rigid, is_rigid, RIGID),
@@ -67,11 +67,11 @@ def checked(thing: Checked) -> Checked: ...
 @overload
 def checked(*, gradients: bool) -> Callable[[Checked], Checked]: ...
 def checked(thing: Any = None, *, gradients: bool = False) -> Any:
-    """Check the arguments of a function, or of a dataclass where it is made, by their annotations.
+    """Check the arguments of a function, or the fields of a dataclass when it is made, against their annotations.
 
-    Numbers of NumPy become Python's. The fields of a value that is an argument are checked again. In a method the
-    letters of shapes have the lengths of the value's fields. A value without `__post_init__` that the library makes
-    itself from tensors is not checked.
+    NumPy numbers become Python numbers. The fields of an argument that is a value are checked again. In a method,
+    letters in shapes have the sizes of the value's fields. A value without `__post_init__` that the library itself
+    makes from tensors is not checked.
 
     Args:
         thing: a function, a method, or a dataclass.
@@ -90,7 +90,7 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
 
 
 def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool]) -> Any:
-    """Return a function that checks its arguments; if `always`, also those that the library gives it."""
+    """Return a function that checks its arguments before the call; `always`: also in calls by the library itself."""
     signature = inspect.signature(function)
     is_method = next(iter(signature.parameters), "") == "self" and not isinstance(owner, type)
     several = {p.name: p.kind for p in signature.parameters.values() if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
@@ -122,7 +122,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
 
 
 def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
-    """Return a value that an annotation allows, its numbers as Python's own; raise `BadArgument` for any other."""
+    """Return an argument that satisfies its annotation, numbers as Python numbers; raise `BadArgument` otherwise."""
     origin, inside = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         return _read_marked(name, value, inside[0], inside[1], call)
@@ -148,7 +148,7 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
 
 
 def _read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
-    """Return a number in a range, or a truth value, as Python's own."""
+    """Return a number in a range, or a boolean, as a Python number; raise `BadArgument` otherwise."""
     number: Any = value
     if kind is bool:
         good = isinstance(value, bool | np.bool_)
@@ -162,7 +162,7 @@ def _read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any
 
 
 def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> Any:
-    """Return a value whose annotation has a mark."""
+    """Return an argument whose annotation has a mark, such as a range or `RIGID`."""
     if isinstance(mark, Range):
         return _read_number(name, value, hint, mark)
     if mark == ANY and hint is float and isinstance(value, float):
@@ -178,7 +178,7 @@ def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> An
 
 
 def _read_union(name: str, value: Any, hint: Any, options: tuple[Any, ...], call: _Call) -> Any:
-    """Return what any option allows; otherwise raise the error of the option that comes nearest."""
+    """Return an argument that satisfies any option of a union; otherwise raise the error of the closest option."""
     errors: list[BadArgument] = []
     for option in (x for x in options if x is not int or float not in options):
         try:
@@ -197,7 +197,7 @@ def _read_union(name: str, value: Any, hint: Any, options: tuple[Any, ...], call
 
 
 def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
-    """Return a tensor of the annotated shape and dtype; bind the letters of the shape."""
+    """Return a tensor of the annotated shape and dtype; record the sizes of the shape's letters."""
     axes, sizes, kind = hint.dim_str.split(), dict(call.sizes), hint.dtype.__name__
     if not isinstance(value, Tensor):
         raise BadArgument(name, show(value), f"a torch {describe(hint)[2:]}")
@@ -216,7 +216,7 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
 
 
 def _read_container(name: str, value: Any, origin: type, inside: tuple[Any, ...], call: _Call) -> Any:
-    """Return a tuple, a sequence or a mapping with its items read; a stream is read as it comes."""
+    """Return a tuple, sequence or mapping whose items were checked; items of a stream are checked as they come."""
     fixed = origin is tuple and inside[-1:] != (...,)
     wrong = not isinstance(value, origin) or isinstance(value, str | bytes | Tensor | np.ndarray)
     if wrong or (fixed and len(value) != len(inside)):
@@ -234,26 +234,26 @@ def _read_container(name: str, value: Any, origin: type, inside: tuple[Any, ...]
 
 
 def _has_tensor(hint: Any) -> bool:
-    """Return whether an annotation names a tensor anywhere."""
+    """Return whether an annotation contains a tensor."""
     inner = () if typing.get_origin(hint) is collections.abc.Callable else typing.get_args(hint)
     return hint is Tensor or is_tensor(hint) or any(map(_has_tensor, inner))
 
 
 @functools.cache
 def _always(kind: type) -> bool:
-    """Return whether a value is checked even if the library makes it: its numbers may come from files."""
+    """Return whether a value class is checked even if the library makes the value: its numbers may come from files."""
     return hasattr(kind, "__post_init__") or not any(map(_has_tensor, _fields(kind).values()))
 
 
 @functools.cache
 def _fields(kind: type) -> dict[str, Any]:
-    """Return the annotations of a dataclass's fields."""
+    """Return the annotations of a dataclass's fields by name."""
     fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
     return {field.name: _hints(kind)[field.name] for field in fields}
 
 
 def _lengths(value: Any) -> dict[str, int]:
-    """Return the lengths of the letters in the annotations of a value's tensors."""
+    """Return the sizes of the shape letters in the annotations of a value's tensors."""
     tensors = {field: hint.dim_str.split() for field, hint in _fields(type(value)).items() if is_tensor(hint)}
     simple = {field: axes for field, axes in tensors.items() if not any(axis[0] in "*.#" for axis in axes)}
     pairs = (pair for field, axes in simple.items() for pair in zip(axes, getattr(value, field).shape, strict=False))
@@ -262,7 +262,7 @@ def _lengths(value: Any) -> dict[str, int]:
 
 @functools.cache
 def _hints(thing: Any) -> dict[str, Any]:
-    """Return the annotations of a function or class, with names that are imported for type checkers alone."""
+    """Return the annotations of a function or class; names that are only imported for type checkers are resolved."""
     late: dict[str, Any] = {}
     while True:
         try:
@@ -273,19 +273,19 @@ def _hints(thing: Any) -> dict[str, Any]:
 
 
 def _option(hint: Any, key: str) -> Any:
-    """Return the annotation of one of `**options`, which have one annotation or those of an unpacked `TypedDict`."""
+    """Return the annotation of one keyword argument of `**options`."""
     return _hints(typing.get_args(hint)[0]).get(key, Any) if typing.get_origin(hint) is Unpack else hint
 
 
 class _ByName(type):
-    """Stands for a class that is not loaded yet: any class of this name counts as it."""
+    """A stand-in for a class that is not loaded yet: every class with this name counts as its instance."""
 
     def __instancecheck__(cls, instance: Any) -> bool:
         return cls.__name__ in {base.__name__ for base in type(instance).__mro__}
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return a finite floating tensor of a shape (None: any length); raise `BadArgument` otherwise."""
+    """Return a finite floating-point tensor of a shape (None: any size); raise `BadArgument` otherwise."""
     call = _Call(gradients=True)
     _read_tensor(name, value, Float[Tensor, " ".join("_" if s is None else str(s) for s in shape)], call)
     call.check_numbers()

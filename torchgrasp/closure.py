@@ -1,4 +1,4 @@
-"""The values of closing a hand: options and gains before, and the measured result after."""
+"""Values of the closing of a hand: options and controller gains before, measured results after."""
 
 import dataclasses
 from typing import Annotated, Literal, NamedTuple
@@ -14,7 +14,7 @@ from torchgrasp.errors import BadArgument, Status
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingGains(Value):
-    """Gains of the closing controller for each finger, in the frame of the hand (Eqs. 26-28).
+    """Targets and gains of the closing controller for each finger, in the hand's frame (Eqs. 26-28).
 
     `force_source` is "analytic", or "stability" if the stability model chose among the balanced forces.
 
@@ -48,9 +48,10 @@ class ObjectMotion(NamedTuple):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Disturbance(Value):
-    """Unplanned contacts of the hand in a trial.
+    """Unintended contacts of the hand in a trial.
 
-    The three columns are contacts with neighbours, with the table, and of other links than the fingers with the object.
+    The three columns are contacts with neighbours, with the table, and contacts of links other than fingertips with the
+    object.
 
     Args:
         first_touch: time [s] of the first contact; infinite without one.
@@ -94,11 +95,11 @@ class ClosingTrace(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureResult(Value):
-    """The result of closing a hand on the true object. A number is NaN if the trial ended before it was measured.
+    """The result of closing a hand on the true object in simulation; NaN if the trial ended before a measurement.
 
     Args:
         held: whether the object was lifted with the hand and slipped little.
-        status: the reason if it was not held.
+        status: `OK`, or the reason why it was not held.
         time: times [s] of the control ticks.
         forces: normal force [N] of each fingertip.
         object_pose: pose of the object in the frame of the grasp.
@@ -109,9 +110,9 @@ class ClosureResult(Value):
         object_motion: motion of the object in the hand from the pre-grasp to the end.
         pushed: motion of the object from the pre-grasp until all fingers touched, or the closing ended.
         before_lift: motion of the object from the start to the lift.
-        unbalanced: norm of the sum of the fingertips' forces before the lift, over the sum of their norms.
-        slip: motion of the object in the hand since the hand pressed.
-        start_overlap: depth [m] of the opened hand in object or table at the start.
+        unbalanced: norm of the sum of the fingertip forces before the lift, relative to the sum of their norms.
+        slip: motion of the object in the hand after the pressing.
+        start_overlap: penetration depth [m] of the opened hand into object or table at the start.
         disturbance: unplanned contacts.
         trace: contacts and estimates at every tick.
         phases: times [s] at which the hand arrived, all fingers touched, and the hand pressed; NaN if never.
@@ -150,14 +151,16 @@ SensorKind = Literal["tactile", "torque", "binary"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingOptions(Value):
-    """Components that the closings "uncertainty" and "fixed" add to the paper's control law.
+    """Components of the closing modes "uncertainty" and "fixed", which extend the paper's control law.
 
     Args:
         wait: a finger that touches waits for the others; then all press together.
-        pose_estimate: touches that come early or late estimate the object's pose, and all contacts move with it.
-        palm_reach: largest displacement [m] of the palm that follows the estimated object; 0: the arm does not yield.
-        stops: how often the approaching hand stops where it touches something, to go around it; 0: never.
-        attempts: how often the hand closes. On a known table it closes again if the grasp seems too weak to lift.
+        pose_estimate: early and late touches update the object-pose estimate, which moves all contacts.
+        palm_reach: largest displacement [m] of the palm, which follows the estimated object pose; 0: the palm does not
+            move.
+        stops: how often the approaching hand may stop at an unexpected contact and move sideways; 0: never.
+        attempts: largest number of closings: on a known table the hand closes again if the grasp seems too weak to
+            lift.
 
     Raises:
         BadArgument: a number outside its range; a palm that moves or a second attempt without `pose_estimate`; stops
@@ -174,7 +177,7 @@ class ClosingOptions(Value):
     attempts: Annotated[int, Range(1, 100)] = 2
 
     def __post_init__(self) -> None:
-        """Check which components need each other."""
+        """Check that components that need each other are on."""
         if not self.pose_estimate and (self.palm_reach or self.attempts > 1):
             found = f"a reach of {self.palm_reach:g} m and {self.attempts} attempts without pose_estimate"
             raise BadArgument("palm_reach", found, "0 m and 1 attempt")
@@ -187,7 +190,11 @@ NO_OPTIONS = ClosingOptions(wait=False, pose_estimate=False, palm_reach=0.0, sto
 
 
 def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptions:
-    """Return the components of a closing: given ones, or all that it has; raise `BadArgument` if it has none."""
+    """Return the components of a closing mode: `options`, or by default all that the mode has.
+
+    Raises:
+        BadArgument: options for a mode that has none.
+    """
     if closing in ("uncertainty", "fixed"):
         return ClosingOptions() if options is None else options
     if options is not None:
@@ -198,11 +205,11 @@ def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptio
 @checked
 @dataclasses.dataclass(frozen=True)
 class SensorModel(Value):
-    """The sensors of a hand's fingertips; `FingertipSensor` simulates them.
+    """The sensors of a hand's fingertips: kind, delay, noise and dead sensors. `FingertipSensor` simulates them.
 
     Args:
-        kind: "tactile": force, place and sliding of each contact, as of a BioTac. "torque": the force alone, from
-            the torques of the finger's joints. "binary": whether the fingertip touches.
+        kind: "tactile": force, position and sliding of each contact, like a BioTac. "torque": only the force, from the
+            torques of the finger's joints. "binary": only whether the fingertip touches.
         delay: age [s] of the readings, in whole samples of the sensor.
         noise: factor on the usual noise.
         dead: names of the fingers whose sensor is known to be broken.
@@ -221,5 +228,5 @@ class SensorModel(Value):
 
     @property
     def full(self) -> bool:
-        """Whether all fingers sense force, place and sliding."""
+        """Whether all fingers sense force, position and sliding."""
         return self.kind == "tactile" and not self.dead

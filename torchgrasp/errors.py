@@ -1,7 +1,7 @@
 """The errors of torchgrasp, and the status of a batch row.
 
-A bad argument raises a subclass of `GraspError` at the public function, before any work. A failed row of a batch
-does not raise: it carries a `Status`, which explains the failure in a sentence.
+A bad argument raises a subclass of `GraspError` at the public function, before any work. A failed row of a batch does
+not raise: it has a `Status`, which explains the failure in a sentence.
 """
 
 import copyreg
@@ -23,7 +23,7 @@ class GraspError(Exception):
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the error with its class and fields, so that worker processes can raise it."""
+        """Support pickling, so that worker processes can return the error."""
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -136,7 +136,7 @@ class Status(enum.IntEnum):
     sentence: str
 
     def __new__(cls, code: int, sentence: str) -> "Status":
-        """Make a member from its integer code and its sentence."""
+        """Make a status from its integer code and its sentence."""
         member = int.__new__(cls, code)
         member._value_ = code
         member.sentence = sentence

@@ -1,4 +1,4 @@
-"""Tasks on worker processes: a worker that hangs or dies loses only its own task."""
+"""Tasks in worker processes: a worker that hangs or dies loses only its own task."""
 
 import contextlib
 import functools
@@ -29,10 +29,10 @@ def run_tasks(
     workers: Annotated[int, Range(0, 1024)] = 1,
     limit: Annotated[float, Range(0.001, math.inf)] = 60.0,
 ) -> Generator[Result | Status, None, None]:
-    """Yield `function(*task)` for each task, in the order of the tasks.
+    """Run `function(*task)` for each task in worker processes; yield the results in the order of the tasks.
 
-    Each task runs on one thread of a fresh process. A task beyond the limit gives `Status.TIMED_OUT`. A task whose
-    process dies twice gives `Status.WORKER_DIED`. All workers end when the caller stops iterating.
+    Each task runs on one thread of a separate process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task
+    whose process dies twice gives `Status.WORKER_DIED`. All workers end when the caller stops iterating.
 
     Args:
         function: a function of a module, so that a worker can import it.
@@ -51,7 +51,7 @@ def run_tasks(
 def run_as_they_end(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Yield the number of each task and its result as in `run_tasks`, in the order in which they end."""
+    """Run tasks as `run_tasks`; yield the index and the result of each task, in the order in which they end."""
     if not workers:
         yield from enumerate(_run_here(function, tasks))
         return
@@ -61,7 +61,7 @@ def run_as_they_end(
 
 
 def _run_here(function: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
-    """Yield the results of this process; between tasks it has its own number of threads."""
+    """Run the tasks in this process on one thread; yield the results."""
     for task in tasks:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
@@ -75,7 +75,7 @@ def _run_here(function: Callable[..., Result], tasks: Iterable[Task]) -> Generat
 def _in_order(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[Result | Status, None, None]:
-    """Yield the results of workers in the order of the tasks."""
+    """Run the tasks in worker processes; yield the results in the order of the tasks."""
     early: dict[int, Future[Result] | Status] = {}
     turn = 0
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
@@ -90,7 +90,7 @@ def _in_order(
 def _run(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Yield the result of each task when it ends; start a new pool if all workers died before they took a task."""
+    """Run the tasks in worker processes; yield index and result as they end. A broken pool of workers is replaced."""
     waiting, died = deque(enumerate(tasks)), set[int]()
     broken = 0
     while waiting:
@@ -105,10 +105,9 @@ def _run(
 def _run_pool(
     function: Callable[..., Result], waiting: deque[tuple[int, Task]], died: set[int], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Yield the results of tasks until all have ended or the pool is broken.
+    """Run tasks in one pool of worker processes, and yield results until all have ended or the pool is broken.
 
-    `waiting` holds the number of each task, and the task; unfinished tasks are put back. `died` holds the numbers of
-    tasks that died once.
+    `waiting` holds index and task; unfinished tasks are put back. `died` holds the indices of tasks that died once.
     """
     try:
         from pebble import ProcessExpired, ProcessPool
@@ -153,12 +152,12 @@ def _run_pool(
 
 
 def _tell(ended: "queue.SimpleQueue[int]", number: int, _: "Future[Any]") -> None:
-    """Report which task ended."""
+    """Put the index of a finished task into the queue."""
     ended.put(number)
 
 
 def _begin(function: Callable[..., Any]) -> None:
-    """Prepare a worker: it has one thread and ends with its parent."""
+    """Prepare a worker process: one thread, and it ends with its parent."""
     torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -1,4 +1,4 @@
-"""Limits of what the library reads from files that anyone may have written. Beyond them a file is refused by name."""
+"""Limits for reading files that anyone may have written: a file beyond a limit is rejected with an error."""
 
 MIN_EXTENT, MAX_EXTENT = 0.005, 2.0  # smallest and largest object [m]: beyond them the unit is most likely wrong
 MESSAGE_LETTERS = 600  # longest part of an error message: other libraries quote whole files

@@ -1,4 +1,4 @@
-"""Marks of annotations, such as ranges, and the rules that argument validation (`torchgrasp.checks`) follows."""
+"""Marks in type annotations, such as ranges, and the rules of argument validation (`torchgrasp.checks`)."""
 
 import collections.abc
 import os
@@ -17,7 +17,10 @@ from torchgrasp.limits import NAME_BYTES, PATH_BYTES, SHOWN_LETTERS
 
 
 class Range(NamedTuple):
-    """The numbers from `low` to `high`, both allowed: `Annotated[float, Range(0.0, 1.0)]`. An error shows `words`."""
+    """A range mark: numbers from `low` to `high` are allowed, both included. An error shows `words`.
+
+    Example: `Annotated[float, Range(0.0, 1.0)]`.
+    """
 
     low: float
     high: float
@@ -25,7 +28,10 @@ class Range(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Marks a batch in a field, as `Annotated[Contacts, Rows("g")]`: it has as many rows as the axis g of tensors."""
+    """A mark for a batch in a field: it must have as many rows as tensors with the axis `letter`.
+
+    Example: `Annotated[Contacts, Rows("g")]`.
+    """
 
     letter: str
 
@@ -58,7 +64,7 @@ NUMBERS = {int: Range(-(2**63), 2**63 - 1, "a whole number"), float: Range(-MOST
 
 
 def describe(hint: Any) -> str:
-    """Return what an annotation allows, in words."""
+    """Return in words which arguments an annotation allows."""
     origin, inside = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated and isinstance(inside[1], Range):
         kind, (low, high, words) = "a whole number" if inside[0] is int else "a number", inside[1]
@@ -80,15 +86,15 @@ def describe(hint: Any) -> str:
 
 
 def is_tensor(hint: Any) -> bool:
-    """Return whether an annotation is that of a tensor, such as `Float[Tensor, "n 3"]`."""
+    """Return whether an annotation is a tensor type such as `Float[Tensor, "n 3"]`."""
     is_array = typing.get_origin(hint) is None and isinstance(hint, type) and issubclass(hint, AbstractArray)
     return is_array and hint.array_type is Tensor
 
 
 def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool:
-    """Return whether a shape has the axes of a jaxtyping annotation, and bind their letters.
+    """Return whether a shape fits the axes of a jaxtyping annotation, and record the sizes of its letters.
 
-    This is jaxtyping's own rule. Its bindings end with each function that is type-checked, so they serve no helper.
+    The rule is jaxtyping's own, but jaxtyping forgets the letters at the end of each checked function.
     """
     for k in [k for k, axis in enumerate(axes) if axis[0] in "*."]:
         letter, end = axes[k].lstrip("*#"), len(shape) - (len(axes) - k - 1)
@@ -115,7 +121,7 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
 
 
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
-    """Refuse a tensor whose numbers are not simply there, or one that requires gradients where none may."""
+    """Raise `BadArgument` for a sparse, nested or meta tensor, or one that requires gradients where none may."""
     if value.layout is not torch.strided or value.is_nested or value.is_meta:
         found = "no numbers (meta)" if value.is_meta else f"a layout of {value.layout}"
         raise BadArgument(name, found, "a dense tensor with numbers")
@@ -126,7 +132,7 @@ def check_dense(name: str, value: Tensor, gradients: bool) -> None:
 
 
 def show(value: Any) -> str:
-    """Describe a wrong value: numbers and texts as they are, tensors by shape, others by their type."""
+    """Return a text for a wrong argument: numbers and texts as they are, tensors by shape, others by type."""
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
     if value is None or isinstance(value, str | int | float):
@@ -137,7 +143,7 @@ def show(value: Any) -> str:
 
 
 def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Return which matrices are a right-handed rotation, up to rounding in float32 or in a text, and a translation."""
+    """Return which matrices are rigid transforms, a right-handed rotation (up to float32 rounding) and translation."""
     x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
     rotation, eye = torch.stack([x, y, z], -2), torch.eye(4, dtype=torch.float64, device=a_from_b.device)
     error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
@@ -146,7 +152,7 @@ def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
 
 
 def check_moved(*args: Any, **kwargs: Any) -> None:
-    """Raise `BadArgument` for arguments that `Tensor.to` does not take, and for other devices or dtypes than ours."""
+    """Raise `BadArgument` for arguments that `Tensor.to` rejects, and for dtypes other than float32 and float64."""
     given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
     allowed = "a device, torch.float32 or torch.float64"
     try:
@@ -158,7 +164,7 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
 
 
 def check_path(name: str, path: Path | str) -> None:
-    """Raise `BadArgument` for a path that no file can have: a NUL, half a character, or too long."""
+    """Raise `BadArgument` for a path that no file can have: with a NUL, a half character, or too long."""
     try:
         raw = os.fsencode(path)
     except UnicodeEncodeError as error:

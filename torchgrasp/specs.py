@@ -1,4 +1,4 @@
-"""Options of contacts and of simulated trials, with units, ranges and defaults."""
+"""Options of contact planning and of simulated trials, with units, ranges and defaults."""
 
 import dataclasses
 from typing import Annotated, Literal
@@ -21,25 +21,26 @@ FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactSpec(Value):
-    """What three to five contacts must satisfy (Eqs. 10-14). `ContactSpec.paper()` is the paper's own.
+    """The constraints on three to five contacts (Eqs. 10-14). `ContactSpec.paper()` gives the paper's.
 
-    The estimated surface differs from the true one, so contacts keep margins beyond the paper's: a lower friction, a
-    flat surface, and the distance of a fingertip.
+    The estimated surface differs from the true one, so the defaults keep larger margins than the paper: a lower
+    friction, a flat surface, and a distance between fingertips.
 
     Args:
         friction: coefficient of friction between fingertip and object at execution.
         edges: edges of the linearised friction cone, at least 3.
         max_variance: S_thresh of Eq. (12), a variance in normalised units.
         friction_margin: contacts are planned and certified with `friction * friction_margin`.
-        separation: least distance between the centres of two fingertips on their contacts [m]; None: their width and
-            2 mm. Contacts on opposite sides of a thin object may be closer.
+        separation: least distance between the centres of two touching fingertips [m]; None: their diameter plus 2 mm.
+            Contacts on opposite sides of a thin object may be closer.
         flatness: largest angle [rad] between the normals at a contact and on a ring around it; None: not checked.
         flat_radius: radius [m] of the ring; None: the largest of `FLAT_RADII` that the object allows.
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None: no table.
         tip_radius: radius [m] of the fingertips, which may rest on the table; 0: points. None: the hand's.
-        start_radius: normalised radius of the sphere from which starts are drawn (Sec. 6.2; the paper: 0.1).
-        fingertips: number of contacts in a row, one for each fingertip: 3, 4 or 5.
-        contact_allowed: whether links may touch and push the target's neighbours; collisions then only cost success.
+        start_radius: normalised radius of the sphere on which initial guesses are drawn (Sec. 6.2; the paper: 0.1).
+        fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
+        contact_allowed: whether links may touch and push the target's neighbours; collisions then only lower the
+            predicted success.
 
     Raises:
         BadArgument: a number outside its range.
@@ -78,7 +79,7 @@ class ContactSpec(Value):
 
     @property
     def ring_radius(self) -> float:
-        """The radius [m] within which the surface at a contact is flat."""
+        """The radius [m] around a contact within which the surface must be flat."""
         return FLAT_RADII[0] if self.flat_radius is None else self.flat_radius
 
     @property
@@ -89,12 +90,12 @@ class ContactSpec(Value):
 
     @property
     def least_height(self) -> float:
-        """The least height [m] of an upright wall that a fingertip above the table can touch."""
+        """The least height [m] of a vertical wall that a fingertip above the table can touch."""
         return self.fingertip_radius + (FLAT_RADII[-1] if self.flat_radius is None else self.flat_radius)
 
     @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
-        """Return the spec with a hand's fingertip radius [m], at least `TIP_RADIUS`, unless the spec has a radius.
+        """Return the spec for fingertips of a radius [m], at least `TIP_RADIUS`, unless `tip_radius` is set.
 
         >>> wide, points = ContactSpec().for_fingertips(0.015), ContactSpec(tip_radius=0.0).for_fingertips(0.015)
         >>> wide.tip_radius, points.tip_radius
@@ -107,7 +108,7 @@ class ContactSpec(Value):
     def paper(
         cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03, table: Plane | float | None = None
     ) -> "ContactSpec":
-        """Return the paper's own problem: full friction, no separation, no flatness; contacts lie above the table.
+        """Return the paper's constraints: full friction, no separation, no flatness, contacts above the table.
 
         >>> ContactSpec.paper(friction=0.8).planned_friction, ContactSpec.paper().flatness
         (0.8, None)
@@ -137,18 +138,19 @@ HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class TrialSpec(Value):
-    """One simulated trial: close on the true mesh, lift it off the table, hold it.
+    """Parameters of a simulated trial: close the hand on the true object, lift it off the table, hold it.
 
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
-            "uncertainty": the same law with further components (`ClosingOptions`). "fixed": the same with equal gains.
-            "paper_position": PI control to the contacts until 0.5 N, the paper's baseline. "position": the same, aimed
-            behind the contacts. "open_loop": pre-grasp, grasp, squeeze.
+            "uncertainty": the same control law with further components (`ClosingOptions`). "fixed": as "uncertainty"
+            with equal gains. "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
+            "position": PI control to goals behind the contacts. "open_loop": joint motion from pre-grasp to grasp to
+            squeeze.
         holding: how the closed hand presses: "force" (balanced forces), "grip" (least forces for the felt load),
             "impedance" (the grasp is a spring in the hand), "position" (joint targets are kept) or "law" (Eq. 25
             continues). In open loop the squeeze is kept.
-        options: components of "uncertainty" or "fixed"; None: all that the closing has.
-        sensor: sensors of the fingertips, which the controller knows.
+        options: components of the closing "uncertainty" or "fixed"; None: all components.
+        sensor: sensors of the fingertips; the controller knows their kind.
         max_force: largest normal force [N] of a fingertip; None: no limit.
         mass: mass of the object [kg].
         friction: coefficient of friction of every contact.
@@ -202,7 +204,7 @@ class TrialSpec(Value):
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
 
     def __post_init__(self) -> None:
-        """Check fields against each other."""
+        """Check fields that depend on each other."""
         choose_options(self.closing, self.options)
         check_sensor(self.sensor, self.closing, self.holding)
         check_force(self.force, self.max_force)
@@ -212,12 +214,12 @@ class TrialSpec(Value):
 
     @property
     def components(self) -> ClosingOptions:
-        """The components of the closing."""
+        """The components of the closing mode."""
         return choose_options(self.closing, self.options)
 
 
 def check_sensor(sensor: SensorModel, closing: str, holding: str) -> None:
-    """Raise `BadArgument` for a closing or holding that needs more than the sensor measures."""
+    """Raise `BadArgument` if a closing or holding mode needs more than the sensor measures."""
     poor = f"one of kind {sensor.kind!r}" + (f" with {', '.join(sensor.dead)} dead" if sensor.dead else "")
     allowed = "kind 'tactile' with no finger dead for {}"
     if not sensor.full and closing in ("position", "paper_position", "paper"):

@@ -1,4 +1,4 @@
-"""A check of a hand of your own: planning and closing rely on these rules of its files and laws of its kinematics."""
+"""Checks of a user's own hand: rules for its files, and laws of its kinematics, on which planning relies."""
 
 import io
 from collections.abc import Iterator
@@ -26,10 +26,10 @@ FK_TOLERANCE = 1e-8  # largest difference [m, and entries of rotations] from the
 
 @checked
 def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
-    """Check a shipped hand, or one in a folder, with a choice of fingers, and return it.
+    """Check a hand, shipped or in a folder, with a choice of grasping fingers, and return it.
 
-    The rules for its files concern coupling, limits, drives, masses, pads, parked joints and self-collision. The laws
-    for the loaded hand, by the names that errors give them:
+    The rules for the files concern coupling, limits, drives, masses, pads, parked joints and self-collision. The laws
+    for the loaded hand are, as errors name them:
 
     * `kinematics`: the poses of all links are those of pytorch-kinematics and of yourdfpy.
     * `jacobian`: the Jacobian of the fingertips equals central differences.
@@ -61,7 +61,7 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 
 def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
-    """Compare the Jacobian with central differences, and rows of a batch with each alone."""
+    """Compare the Jacobian with central differences, and the rows of a batch with single postures."""
     # Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian
     step, allowed = 1e-6, 1e-6
     steps = step * torch.eye(hand.dof, dtype=torch.float64)
@@ -79,7 +79,7 @@ def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
 
 
 def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Iterator[HandFileError]:
-    """Yield every broken rule of a hand; raises as `load_hand` if it cannot be loaded."""
+    """Yield an error for every broken rule of a hand's files; raises as `load_hand` if the hand cannot be loaded."""
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf, hand = read_urdf(spec.urdf), load_hand(name_or_path, fingers)
     yield from _wrong_bodies(urdf)
@@ -88,13 +88,13 @@ def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Itera
 
 
 def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
-    """Draw postures uniformly within the limits [rad]."""
+    """Return n random postures, uniform within the joint limits [rad]."""
     share = torch.rand(n, hand.dof, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return hand.lower + (hand.upper - hand.lower) * share
 
 
 def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
-    """Return the two links that overlap in the most postures."""
+    """Return the names of the two links that overlap in the most postures."""
     apart = hand.self_collision.separations(hand.tree.frames(hand.expand_joints(joints).T.contiguous()), 0.0)
     links = hand.self_collision.link[hand.self_collision.pairs[int((apart < 0).sum(1).argmax())]]
     one, two = (hand.tree.link_names[int(k)] for k in links)
@@ -102,7 +102,7 @@ def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
 
 
 def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
-    """Find masses and inertias that are physically impossible."""
+    """Yield errors for masses and inertias that are physically impossible."""
     for link in urdf.links:
         if not link.mass > 0:
             yield urdf.wrong(f"link {link.name} of mass {link.mass} kg", "a positive mass")
@@ -114,7 +114,7 @@ def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
 
 
 def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileError]:
-    """Find drives without effort, and parked or coupled joints beyond their limits."""
+    """Yield errors for drives without effort, and for parked or coupled joints beyond their limits."""
     for joint in urdf.movable:
         if not (joint.effort > 0 and joint.velocity > 0):
             found = f"joint {joint.name} of effort {joint.effort}, velocity {joint.velocity}"
@@ -127,7 +127,7 @@ def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileEr
 
 
 def _wrong_pads(urdf: Urdf, spec: HandSpec) -> Iterator[HandFileError]:
-    """Find fingers with wrong joints, and contacts inside the tip's own shapes."""
+    """Yield errors for fingers with wrong joints, and for contact points inside the tip's own shapes."""
     shapes = {x.name: x.shapes for x in urdf.links}
     for finger in spec.all_fingers:
         movers = [j.name for j in reversed(urdf.movers(finger.tip_link))]
@@ -141,7 +141,7 @@ def _wrong_pads(urdf: Urdf, spec: HandSpec) -> Iterator[HandFileError]:
 
 
 def _inside(point: np.ndarray, shape: Shape) -> bool:
-    """Tell whether a point of a link lies in a shape."""
+    """Return whether a point of a link lies inside a shape."""
     x, y, z = rotation_from_rpy(shape.rpy).numpy().T @ (point - shape.xyz)
     if shape.kind == "box":
         return bool((2 * np.abs([x, y, z]) < shape.size).all())
@@ -151,7 +151,7 @@ def _inside(point: np.ndarray, shape: Shape) -> bool:
 
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
-    """Return the largest difference of a pose from yourdfpy's and pytorch-kinematics', and its link."""
+    """Return the largest difference of link poses from yourdfpy's and pytorch-kinematics', and the link's name."""
     import yourdfpy
 
     urdf, poses = read_urdf(hand.urdf_path), hand.link_poses(joints).double()
@@ -166,7 +166,7 @@ def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, s
 
 
 def reference_poses(urdf: Urdf, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-    """Return `root_from_link` of every link by pytorch-kinematics, in the dtype of `values`."""
+    """Return `root_from_link` of every link, computed by pytorch-kinematics in the dtype of `values`."""
     chain = chain_from_urdf(urdf, values.dtype)
     names = [j.name for j in urdf.movable]
     order = [names.index(name) for name in chain.get_joint_parameter_names()]

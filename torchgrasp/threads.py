@@ -1,4 +1,4 @@
-"""One thread of torch within a call: on busy cores several threads wait for each other most of the time."""
+"""Calls that use one torch thread: on busy cores several threads mostly wait for each other."""
 
 import contextlib
 import functools
@@ -18,7 +18,7 @@ _state = {"calls": 0, "before": 1}
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread within the context; afterwards it uses as many as before."""
+    """Let torch use one thread within the context; the number of threads is restored afterwards."""
     if getattr(_here, "inside", False):
         yield
         return
@@ -38,7 +38,7 @@ def one_thread() -> Iterator[None]:
 
 
 def single_threaded(function: Function) -> Function:
-    """Return a function that runs within `one_thread`; a generator does so each time that it computes an item."""
+    """Return a function that runs within `one_thread`; a generator runs within it for each item."""
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

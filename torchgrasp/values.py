@@ -1,7 +1,7 @@
 """The values of the data flow, in its order. Options are in `torchgrasp.specs`.
 
 A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths are in metres.
-Positions are in the frame of the cloud ("obj") unless said otherwise. `a_from_b` maps coordinates of frame b into a.
+Positions are in the frame of the cloud ("obj") unless stated otherwise. `a_from_b` maps coordinates of frame b into a.
 
 Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five), e friction-cone edges, h actuated
 joints, t time steps.
@@ -24,14 +24,14 @@ from torchgrasp.files import read_value, save_tensors
 @checked
 @dataclasses.dataclass(frozen=True)
 class PointCloud(Value):
-    """The visible points of one object.
+    """The measured surface points of one object, with optional normals and camera positions.
 
     Args:
         points: surface points [m], at least 4.
         normals: outward normals of any length, or None.
         viewpoint: position of the camera [m], or of each point's camera; None: unknown.
-        frustum: inward unit normals of the four sides of the camera's view, or of each point's view; None: unknown. An
-            object that reaches a side continues beyond it.
+        frustum: inward unit normals of the four sides of the camera's field of view, or of each point's; None: unknown.
+            An object that reaches a side is cut off there.
 
     Raises:
         BadArgument: wrong shape, dtype or non-finite numbers.
@@ -54,15 +54,15 @@ class PointCloud(Value):
             raise TooFewPoints("points", f"{len(self.points)} points", "at least 4 points")
 
     def __len__(self) -> int:
-        """Count the points."""
+        """Return the number of points."""
         return len(self.points)
 
     @checked
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
-        """Return some of the points, with their normals and viewpoints.
+        """Return a cloud of some of the points, with their normals and viewpoints.
 
         Args:
-            rows: a mask, or indices in the order wanted.
+            rows: a mask, or indices in the wanted order.
         """
         normals, eye, frustum = self.normals, self.viewpoint, self.frustum
         chosen = read_rows(rows, len(self))
@@ -90,7 +90,7 @@ class PointCloud(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ShapeEstimate(Value):
-    """The posterior of the shape at query points (Eqs. 7-8).
+    """The estimated shape at query points: posterior of signed distance and normal (Eqs. 7-8).
 
     `distance`, `variance` and `covariance` are in the normalised units of the paper: one unit is `shape.scale` metres.
     `normal` is the unit gradient of the mean. `std_m` [m] is the calibrated standard deviation of the surface:
@@ -107,7 +107,7 @@ class ShapeEstimate(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Contacts(Batch):
-    """Three to five contacts a row, one for each fingertip: `points` [m] and outward unit `normals`.
+    """Contact sets of three to five contacts, one for each fingertip: `points` [m] and outward unit `normals`.
 
     `variance` (Eq. 12, normalised units) and `std_m` [m] are the uncertainty of the surface at the contacts, or None if
     it is unknown, as for contacts of another planner. All tensors have one dtype.
@@ -124,18 +124,18 @@ class Contacts(Batch):
     std_m: Annotated[Float[Tensor, "b f"], ANY] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse tensors of two precisions."""
+        """Check that all tensors have the same dtype."""
         found = {str(x.dtype) for x in (self.points, self.normals, self.variance, self.std_m) if x is not None}
         if len(found) > 1:
             raise BadArgument("contacts", " beside ".join(sorted(found)), "one dtype for all")
 
     @property
     def fingertips(self) -> int:
-        """The number f of contacts in a row."""
+        """The number f of contacts in a set."""
         return self.points.shape[-2]
 
     def require_std(self) -> Float[Tensor, "b f"]:
-        """Return `std_m`; raise `BadArgument` if these contacts have none."""
+        """Return `std_m`; raise `BadArgument` if the contacts have none."""
         if self.std_m is None:
             raise BadArgument("contacts.std_m", "None", "the standard deviation [m] of the surface at each contact")
         return self.std_m
@@ -144,10 +144,10 @@ class Contacts(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactPlan(Batch):
-    """The planned contacts, one row for each start, in the order of the starts.
+    """Planned contact sets, one for each initial guess, in their order.
 
-    `coefficients` is phi of Eq. (13). `quality` is Eq. (14), the distance [m] of the contacts' centre from the centre
-    of the cloud. Less is better.
+    `coefficients` is phi of Eq. (13). `quality` is Eq. (14), the distance [m] of the contacts' centroid from the
+    cloud's centre; less is better.
     """
 
     contacts: Annotated[Contacts, Rows("b")]
@@ -159,7 +159,7 @@ class ContactPlan(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """The proof that contacts have frictional form closure (Eq. 13), or that they do not; see `certify`.
+    """The proof that contact sets have frictional form closure (Eq. 13), or that they have not; see `certify`.
 
     `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio` is the smallest over the largest
     singular value of W, torques divided by the radius of the contacts. `residual` is the largest |W phi|. `closed`
@@ -179,7 +179,8 @@ class Certificate(Batch):
 class ContactCode(Value):
     """The frame-invariant code q = (L, N) of Eq. (18) for the six assignments of contacts to fingers.
 
-    In assignment k finger i touches contact `permutation[k, i]`. Degenerate rows hold NaN, and `status` says so.
+    In assignment k finger i touches contact `permutation[k, i]`. Degenerate contact sets have NaN and a `status` other
+    than OK.
     """
 
     q: Annotated[Float[Tensor, "b 6 6"], ANY]
@@ -191,11 +192,11 @@ class ContactCode(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSeeds(Batch):
-    """Initial guesses of the inverse kinematics: postures placed on contacts by their virtual frames (Eq. 24).
+    """Initial guesses for inverse kinematics: postures placed on contacts by their virtual frames (Eq. 24).
 
-    `row` is the row of the contacts, `permutation` the contact of each finger. `energy` is the least f_i of Eq. (21),
-    or half the squared distance of a library posture. `tip_error` [m] is the distance of each fingertip from its
-    contact.
+    `row` is the index of the contact set, `permutation` the contact of each finger. `energy` is the least f_i of Eq.
+    (21), or half the squared feature distance of a library posture. `tip_error` [m] is the distance of each fingertip
+    from its contact.
     """
 
     joints: Float[Tensor, "g h"]
@@ -209,7 +210,7 @@ class IKSeeds(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Grasps(Batch):
-    """Hand configurations on planned contacts, best first.
+    """Grasps: hand configurations with their contacts, certificates and checks, best first.
 
     Finger i touches contact i. `pregrasp` is the joints of the opened hand at the same pose; `approach` is the unit
     direction of its straight path there. `clearance` [m] is the least distance of the links from the estimated
@@ -271,7 +272,7 @@ def load_grasps(path: Path | str) -> Grasps:
 
 
 def check_grasps(path: Path | str, grasps: Grasps) -> None:
-    """Raise `ModelFileError` for grasps of a file that `Grasps.save` cannot have written."""
+    """Raise `ModelFileError` if grasps from a file cannot have been written by `Grasps.save`."""
     f = grasps.contacts.fingertips
     wrong = {
         f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]]),

@@ -107,7 +107,7 @@ def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_pat
     assert "the hand can grasp" in capsys.readouterr().out
 
 
-def test_what_is_doubtful_is_named_with_its_mend(claw, capsys):
+def test_hand_check_prints_warnings_with_their_fixes(claw, capsys):
     """A pad that faces away, and a link that is always in another's way."""
     text = claw.read_text().replace('<box size="0.016 0.02 0.056"/>', '<box size="0.055 0.055 0.056"/>')
     claw.write_text(text)
@@ -119,7 +119,7 @@ def test_what_is_doubtful_is_named_with_its_mend(claw, capsys):
     toml.write_text(toml.read_text().replace(pad, away))
     main(["hand", "check", str(claw.parent), "--out", str(claw.parent / "hand.png")])
     said = capsys.readouterr().out
-    assert "doubtful: default: only" in said and "doubtful: default: the pad of left faces" in said
+    assert "warning: default: only" in said and "warning: default: the pad of left faces" in said
 
 
 def test_every_set_of_fingers_is_checked_and_tried(tmp_path, capsys, monkeypatch):

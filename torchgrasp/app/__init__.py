@@ -1,1 +1,1 @@
-"""Applications of the library: command line, reports, drafts of hands. Not public."""
+"""Applications of the library: command line, reports, authoring of new hands."""

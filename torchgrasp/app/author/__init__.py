@@ -1,4 +1,4 @@
-"""Drafts of hands from published URDFs: repairs, fitted shapes, guessed fingertips, a first hand.toml."""
+"""Authoring of hand files from published URDFs: repairs, fitted shapes, guessed fingertip pads, a first hand.toml."""
 
 from torchgrasp.app.author.draft import Draft, Wish, draft_hand, new_hand
 

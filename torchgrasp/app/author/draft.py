@@ -1,7 +1,7 @@
 """A first hand.toml for a URDF, and a clean copy of the URDF: fingers, pads, coupling, pairs of links.
 
-A published URDF is repaired (`repair`), its meshes become simple shapes (`fit_shapes`), its pads are guessed (`pads`).
-Every guess is marked.
+A published URDF is repaired (`repair`), its meshes are replaced by simple shapes (`fit_shapes`), and the fingertip pads
+are guessed (`pads`). Every guess is marked in the text.
 """
 
 import json
@@ -29,7 +29,7 @@ OPTIONS = {"default": 3, "four": 4, "five": 5}  # sets of fingers that a draft d
 
 
 class Draft(NamedTuple):
-    """A first hand.toml, the clean URDF that it names, and a sentence for each repair.
+    """A first hand.toml, the clean URDF that it refers to, and a sentence for each repair of the URDF.
 
     `urdf` is empty if the published URDF is clean.
 
@@ -43,7 +43,7 @@ class Draft(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """A user's choices for a hand: the links of its tips, its name, the root below an arm, the folder of meshes.
+    """The user's choices for a new hand: links of the fingertips, name, root link below an arm, folder of meshes.
 
     >>> Wish(tips=("thumb_tip", "index_tip", "ring_tip"), name="mine").root
     ''
@@ -60,11 +60,11 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     """Return the text of a hand.toml for a clean URDF, to be reviewed by the user and checked by `check_hand`.
 
     Args:
-        path: of the URDF.
+        path: the URDF.
         tips: links of the fingertips in grasp order, first the three of option "default"; "four" and "five" add the
             next tips. By default the ends of the branches, in the order in which their pads best face each other.
-        name: of the hand; by default the name of the robot.
-        seed: of the random postures.
+        name: name of the hand; by default the name of the robot.
+        seed: random seed.
 
     Raises:
         HandFileError: the URDF is missing or malformed, or needs repair by `new_hand`.
@@ -86,9 +86,9 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
     """Repair a published URDF, and draft a hand.toml for the clean copy, which the user saves as `file`.
 
     Args:
-        path: of the URDF.
+        path: the URDF.
         wish: the user's choices.
-        seed: of the random postures.
+        seed: random seed.
         file: name of the clean copy.
 
     Raises:
@@ -134,14 +134,14 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
 
 
 def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4 _ n"]:
-    """Return the frames of some links in random postures, in chunks that bound the memory."""
+    """Return the frames of some links in random postures, computed in chunks to bound the memory."""
     tree, at = tree_from_urdf(urdf), [[x.name for x in urdf.links].index(link) for link in links]
     values = draw_postures(urdf, _coupling(urdf), 20_000, seed)
     return torch.cat([tree.frames(part)[:, :, at] for part in values.split(1000, 1)], -1)
 
 
 def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the given or found links of the fingertips; refuse too few or too many, and links that cannot touch."""
+    """Return the fingertip links, given or found; raise `BadArgument` for a wrong number, or unusable links."""
     ends = fingertip_links(urdf)
     chosen = tips or ends
     if not FINGERTIPS[0] <= len(chosen) <= FINGERTIPS[1] or len(set(chosen)) < len(chosen):
@@ -155,12 +155,12 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _coupling(urdf: Urdf) -> dict[str, Mimic]:
-    """Return the coupled joints by name."""
+    """Return the coupling of each coupled joint by name."""
     return {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
 
 
 def _gains(urdf: Urdf) -> tuple[float, float]:
-    """Return stiffness [N m/rad] and damping [N m s/rad] of the drives, similar to those of the shipped hands."""
+    """Return stiffness [N m/rad] and damping [N m s/rad] for the drives, similar to those of the shipped hands."""
     rotor = 1e-3  # inertia [kg m2] that simulations add to each joint; the damping is at least critical with it
     free = [j for j in urdf.movable if j.mimic is None]
     kp = min(4.0 * min(j.effort for j in free), 10.0)
@@ -181,7 +181,7 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
 def _toml_text(
     urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]], approach: Triple, names: tuple[str, str], seed: int
 ) -> str:
-    """Write a hand.toml, with pads by links, links by options, and the names of the hand and of its URDF file."""
+    """Return the text of a hand.toml; `pads` are by link, `sets` by option; `names` are of hand and URDF file."""
     coupling, (kp, kd) = _coupling(urdf), _gains(urdf)
     lines = [
         "# A draft. Lengths [m], angles [rad], in the link frames of the URDF. Look over what is marked CHECK.",
@@ -206,7 +206,7 @@ def _toml_text(
 
 
 def _finger_lines(urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]]) -> list[str]:
-    """Return the lines of a hand.toml on its options and fingers."""
+    """Return the lines of a hand.toml for its options and fingers."""
     chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
     called = {tip: tip.removesuffix("_tip") for tip in pads}
     lines = ["# Which fingers grasp, in grasp order; every other joint is parked."]
@@ -228,14 +228,14 @@ def _finger_lines(urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]]) 
 
 
 def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
-    """Return the positions of joints that neither grasp nor lead nor follow: zero, or the limit next to zero."""
+    """Return the positions at which joints that do not take part in grasping are parked: zero, or the nearest limit."""
     coupling = _coupling(urdf)
     moved = grasping | {coupling[j].source for j in grasping if j in coupling}
     return {j.name: j.rest for j in urdf.movable if j.name not in coupling and j.name not in moved}
 
 
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
-    """Return the last link with a collision shape of every movable branch."""
+    """Return the last link with a collision shape on every branch that joints move."""
     parents, shaped = {j.parent for j in urdf.joints}, {x.name for x in urdf.links if x.shapes}
     ends = []
     for link in (x.name for x in urdf.links if x.name not in parents):

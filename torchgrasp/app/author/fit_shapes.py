@@ -1,6 +1,6 @@
-"""Boxes, cylinders and balls in place of the meshes of a published hand.
+"""Replacement of the meshes in a published hand by boxes, cylinders and balls.
 
-A mesh is sampled. Its points get a bounding box, and a box is cut in two where the cut saves most volume.
+A mesh is sampled by points, which get a bounding box. A box is cut in two where this saves most volume.
 """
 
 import dataclasses
@@ -34,10 +34,10 @@ Corners = tuple[np.ndarray, np.ndarray]
 
 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
-    """Return the file of a mesh, which must lie in `folder`; `package://` means a path inside the folder.
+    """Return the path of a mesh file, which must lie in `folder`; `package://` means a path inside the folder.
 
     Raises:
-        HandFileError: no such file in the folder, a file of another format, or one that is too large.
+        HandFileError: no such file in the folder, a file of another format, or a file that is too large.
     """
     base, kinds = folder.resolve(), ", ".join(MESH_KINDS)
     refusal = urdf.wrong(f"mesh {name[:80]!r}", f"a mesh ({kinds}) of at most {MESH_BYTES >> 20} MiB inside {folder}")
@@ -59,7 +59,7 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
 
 
 def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
-    """Return points [m] on each shape of every link, in the link's frame; meshes must lie in `folder`.
+    """Return points [m] on each collision shape of every link, in the link's frame.
 
     Raises:
         HandFileError: a mesh is missing, outside the folder, too large or malformed.
@@ -85,7 +85,7 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 
 
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
-    """Replace every mesh by a few boxes or a cylinder around its points; report their number."""
+    """Replace every mesh by a few boxes or a cylinder around its points; report the numbers."""
     links, count, made = [], 0, 0
     for link in urdf.links:
         shapes: list[Shape] = []
@@ -99,9 +99,10 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
 
 
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
-    """Give a tip a ball, and boxes close to its surface up to the centre of the ball.
+    """Replace the shapes of a fingertip by a ball at its end, and boxes up to the ball's centre.
 
-    `outward` points to the finger's end, `points` lie on the tip. A tip shorter than 2.6 radii gets the ball alone.
+    `outward` is the direction to the end of the finger, `points` lie on the tip. A tip shorter than 2.6 radii gets only
+    the ball.
     """
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
@@ -116,7 +117,7 @@ def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Point
 
 
 def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
-    """Read a mesh without the files that it names; return points on it."""
+    """Read a mesh file, but no file that it refers to; return points on the mesh."""
     import trimesh
 
     path = mesh_file(urdf, name, folder)
@@ -143,7 +144,7 @@ def _primitive_points(shape: Shape) -> Points:
 
 
 def _sample(mesh: "trimesh.Trimesh") -> Points:
-    """Return points on a mesh, with its corners."""
+    """Return random points on a mesh, and its vertices."""
     count = 4000  # points on each shape
     from trimesh.sample import sample_surface
 
@@ -153,7 +154,7 @@ def _sample(mesh: "trimesh.Trimesh") -> Points:
 
 
 def fit_shapes(points: Points) -> list[Shape]:
-    """Cover points on a body by a few boxes, or by a cylinder."""
+    """Return a few boxes, or a cylinder, that cover the points on a body."""
     round_share = 0.9  # a cylinder replaces boxes if its volume is less than this share of their volume
     turn = _axes(points)
     local = points @ turn
@@ -170,7 +171,7 @@ def fit_shapes(points: Points) -> list[Shape]:
 
 
 def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
-    """Return the axes of the boxes as columns: the link's axes, unless others fit much better."""
+    """Return the axes of the boxes as columns: those of the link, unless rotated axes fit much better."""
     turned_share = 0.85  # a box is turned out of the link's axes if its volume falls below this share
     from trimesh.bounds import oriented_bounds
 
@@ -182,12 +183,12 @@ def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
 
 
 def _boxes(corners: list[Corners], axes: np.ndarray) -> list[Shape]:
-    """Return boxes from their corners along axes, the columns."""
+    """Return boxes from their lower and upper corners along `axes` (columns)."""
     return [_shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners]
 
 
 def _cut(points: Points, most: int, saving: float) -> list[Corners]:
-    """Return the lower and upper corners of boxes around points."""
+    """Return the lower and upper corners of at most `most` boxes that cover the points."""
     cells = [(points.min(0), points.max(0), points)]
     while len(cells) < most:
         total = sum(float(np.prod(high - low)) for low, high, _ in cells)
@@ -200,7 +201,7 @@ def _cut(points: Points, most: int, saving: float) -> list[Corners]:
 
 
 def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[float, list]]:
-    """Return the volume that each cut of a box saves, and the two boxes; none is shorter than 8 mm."""
+    """Return each way to cut a box in two: the saved volume, and both boxes, none shorter than 8 mm."""
     found = []
     for axis in range(3):
         for at in np.linspace(low[axis], high[axis], 12)[1:-1]:

@@ -1,7 +1,7 @@
-"""Guessed pads of fingertips: their contact points and normals.
+"""Guesses of fingertip pads: their contact points and normals.
 
-A URDF does not define the pads. Here a pad faces the direction in which the finger's last joint bends. A joint bends to
-the side with most of its range; if both sides have as much, it bends towards the other fingertips.
+A URDF does not define pads. The guessed pad faces the direction in which the finger's last joint bends: the side with
+most of the joint's range or, for a symmetric range, towards the other fingertips.
 """
 
 import itertools
@@ -32,7 +32,7 @@ Points = Float[np.ndarray, "_ 3"]
 
 
 class Guess(NamedTuple):
-    """Pads of fingertips, the direction to each finger's end in its tip's frame, and the direction out of the palm."""
+    """Guessed fingertip pads, direction to each finger's end in its tip's frame, and direction out of the palm."""
 
     pads: tuple[Pad, ...]
     outward: tuple[Vector, ...]
@@ -42,10 +42,10 @@ class Guess(NamedTuple):
 def guess_pads(
     urdf: Urdf, frames: Float[Tensor, "3 4 _ n"], tips: Sequence[str], surfaces: Mapping[str, Points]
 ) -> Guess:
-    """Guess the pads of the tips and the direction out of the palm, from frames of tips and palm in random postures.
+    """Guess the fingertip pads and the direction out of the palm; `frames` are of tips and palm in random postures.
 
-    A tip of one box, cylinder or sphere has its pad on that shape. Another tip gets a ball that touches its surface,
-    of points (n, 3) in `surfaces`.
+    A tip with a single box, cylinder or sphere gets its pad on this shape. Another tip gets a ball that touches its
+    surface, given by points (n, 3) in `surfaces`.
     """
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
@@ -74,16 +74,16 @@ def guess_pads(
 
 
 def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
-    """Return the link that carries most of the fingers."""
+    """Return the link from which most fingers start."""
     bases = Counter(urdf.movers(tip)[-1].parent for tip in tips)
     return max(bases, key=lambda name: bases[name])
 
 
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
-    """Return the tips, first the three whose pads most often face their middle, then one by one those that face best.
+    """Return the order of the tips: first the three whose pads face each other most often, then the others one by one.
 
-    A pad faces the middle within 45 degrees, from 1.5 to 8 cm away, as for an object. `frames` are the frames of the
-    tips in random postures.
+    A pad counts as facing the middle of the pads within 45 degrees and 1.5 to 8 cm, as for an object. `frames` are the
+    tips' frames in random postures.
     """
     contacts, normals = (torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal"))
     points, directions = map_points(frames, contacts), map_directions(frames, normals)
@@ -103,12 +103,12 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
 
 
 def is_primitive(link: Link) -> bool:
-    """Return whether a link is one box, cylinder or sphere."""
+    """Return whether the collision shape of a link is a single box, cylinder or sphere."""
     return len(link.shapes) == 1 and link.shapes[0].kind != "mesh"
 
 
 def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
-    """Return a ball inside the end of a body that touches the body's surface where the pad is."""
+    """Return a pad on a ball inside the end of a finger; the ball touches the finger's surface at the pad."""
     axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
     local = points @ axes
     end = local[:, 1].max()
@@ -127,7 +127,7 @@ def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
 
 
 def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
-    """Return the last joint that moves a tip; in the tip's frame, its direction of motion and that from the joint."""
+    """Return the last joint that moves a tip, the tip's motion in its frame, and the direction from the joint to it."""
     tip_from_above = np.eye(4)
     for joint in urdf.joints_above(tip):
         if joint.kind != "fixed":
@@ -143,7 +143,7 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
 
 
 def _half(shape: Shape) -> Vector:
-    """Return the half sizes of a shape's bounding box."""
+    """Return the half sizes of the bounding box of a shape."""
     if shape.kind == "box":
         return np.array(shape.size) / 2
     radius = shape.size[0]
@@ -151,7 +151,7 @@ def _half(shape: Shape) -> Vector:
 
 
 def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
-    """Return a point at the far end of a tip, in its frame; in a simple shape half a thickness before the end."""
+    """Return a point near the far end of a tip, in its frame; in a simple shape half a thickness before the end."""
     if not is_primitive(link):
         points, pose = surfaces[link.name], pose_in_carrier(urdf, link.name)[1].numpy()
         reach = np.linalg.norm(points @ pose[:, :3].T + pose[:, 3], axis=1)
@@ -164,7 +164,7 @@ def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
 
 
 def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
-    """Return the pad of a tip: the side towards its motion, on a sphere tilted towards the end of the finger."""
+    """Return the pad of a tip with a simple shape: on the side towards its motion; on a sphere tilted to the end."""
     if shape.kind == "sphere":
         normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]
         center, normal = np.array(shape.xyz), normal / np.linalg.norm(normal)

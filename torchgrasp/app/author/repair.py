@@ -1,4 +1,4 @@
-"""Repair of published URDFs: frames without mass, wrists, masses, limits, followers; and the text of the clean copy.
+"""Repair of published URDFs: massless frames, wrists, masses, limits, coupled joints; and the text of the clean copy.
 
 Every step returns the repaired URDF and a sentence for each repair.
 """
@@ -38,7 +38,7 @@ def place(pose: np.ndarray) -> tuple[Triple, Triple]:
 
 
 def keep_below(urdf: Urdf, root: str) -> Step:
-    """Keep a link and the links below it: the hand on an arm."""
+    """Keep only a link and the links below it, such as the hand on an arm."""
     names = {x.name for x in urdf.links}
     if root not in names:
         raise BadArgument("root", repr(root), f"a link of {urdf.path}: {sorted(names)}")
@@ -56,9 +56,10 @@ def keep_below(urdf: Urdf, root: str) -> Step:
 
 
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
-    """Merge frames without mass into the body to which they are fixed; also return the body of each merged link.
+    """Merge massless frames into the link to which they are fixed; also return the link of each merged frame.
 
-    A root without mass takes the body that is fixed to it. An end with a shape remains, since it may be a fingertip.
+    A massless root takes over the link that is fixed to it. A last link with a shape is kept, because it may be a
+    fingertip.
     """
     taken: dict[str, str] = {}
     while True:
@@ -86,13 +87,13 @@ def _is_body(link: Link) -> bool:
 
 
 def _under(joint: Joint, above: Joint) -> Joint:
-    """Return a joint fixed to the parent of the frame that was its parent."""
+    """Return a joint moved from a merged frame to the frame's parent."""
     xyz, rpy = place(pose_of(above) @ pose_of(joint))
     return dataclasses.replace(joint, parent=above.parent, xyz=xyz, rpy=rpy)
 
 
 def _moved(link: Link, pose: np.ndarray) -> Link:
-    """Return a link's body and shapes in another frame."""
+    """Return a link with mass, inertia and shapes in another frame."""
     turn, shapes = pose[:3, :3], []
     for shape in link.shapes:
         xyz, rpy = place(pose @ pose_of(shape))
@@ -103,7 +104,7 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
 
 
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
-    """Fix the joints of a wrist, which move all fingertips `tips`; cut off an arm, which has more than three."""
+    """Fix the wrist joints, which move all fingertips; if there are more than three of them, cut off the arm."""
     common = [j for j in urdf.movers(tips[0]) if all(j in urdf.movers(tip) for tip in tips)] if len(tips) > 2 else []
     if len(common) > 3:
         urdf, done = keep_below(urdf, common[0].child)
@@ -130,14 +131,14 @@ def _fixed(joint: Joint, value: float) -> Joint:
 
 
 def repair_joints(urdf: Urdf) -> Step:
-    """Add missing limits and drives; let coupled joints follow an independent joint, within the limits of both."""
+    """Add missing limits and drives; make every coupled joint follow an independent joint within both limits."""
     joints = {j.name: j for j in urdf.joints}
     done = _add_limits(urdf, joints) + _add_drives(joints) + _follow_directly(joints) + _limit_leaders(urdf, joints)
     return dataclasses.replace(urdf, joints=tuple(joints.values())), done
 
 
 def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
-    """Limit endless turning joints to half a turn either way; refuse endless sliding joints."""
+    """Limit endless revolute joints to half a turn either way; raise `HandFileError` for endless sliding joints."""
     endless = [j for j in urdf.movable if math.isinf(j.upper - j.lower)]
     for j in endless:
         if j.kind == "prismatic":
@@ -147,7 +148,7 @@ def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 
 
 def _add_drives(joints: dict[str, Joint]) -> list[str]:
-    """Give joints without effort or velocity those of small hands."""
+    """Give joints without effort or velocity typical values of small hands."""
     idle = [j for j in joints.values() if j.kind != "fixed" and not (j.effort > 0 and j.velocity > 0)]
     for j in idle:
         effort, velocity = (x if x > 0 else usual for x, usual in ((j.effort, EFFORT), (j.velocity, VELOCITY)))
@@ -157,7 +158,7 @@ def _add_drives(joints: dict[str, Joint]) -> list[str]:
 
 
 def _follow_directly(joints: dict[str, Joint]) -> list[str]:
-    """Let followers of followers follow the first joint of their chain."""
+    """Make joints coupled to a coupled joint follow the independent joint at the start of the chain."""
     done = []
     for name, j in joints.items():
         mimic = j.mimic
@@ -170,7 +171,7 @@ def _follow_directly(joints: dict[str, Joint]) -> list[str]:
 
 
 def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
-    """Limit each leader to the positions at which its followers are within their limits."""
+    """Limit each independent joint to positions at which the joints coupled to it are within their limits."""
     done = []
     for name, j in joints.items():
         if (mimic := j.mimic) is None:
@@ -193,7 +194,7 @@ def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 
 
 def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
-    """Add masses and inertias where they are missing or impossible for a body; `surfaces` are points (n, 3)."""
+    """Replace missing or impossible masses and inertias; `surfaces` are points (n, 3) on each link."""
     # Least mass [kg] and edge [m] of a body without mass, so that simulators remain stable
     least_mass, least_size = 1e-3, 5e-3
     far_out = 2.0  # farthest mass centre and radius of gyration, in half diagonals of the bounding box
@@ -238,7 +239,7 @@ def _triangle(inertia: np.ndarray) -> tuple[float, ...]:
 
 
 def urdf_text(urdf: Urdf) -> str:
-    """Write a URDF, its links, joints and shapes; `read_urdf` reads the same from it."""
+    """Return a URDF as XML text, which `read_urdf` reads without loss."""
     robot = ET.Element("robot", name=urdf.name)
     for link in urdf.links:
         element = ET.SubElement(robot, "link", name=link.name)

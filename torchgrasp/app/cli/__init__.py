@@ -1,4 +1,4 @@
-"""The command line.
+"""The command line `torchgrasp`.
 
 Exit codes: 0 done, 1 no executable grasp or object not held, 2 bad input, 130 interrupted, 143 terminated.
 """
@@ -119,7 +119,7 @@ def run_and_exit() -> NoReturn:
 
 
 def _guard(given: list[str]) -> int:
-    """Run a command, and print each error as a sentence; return the exit code."""
+    """Run a command, print each error as one sentence on stderr, and return the exit code."""
     try:
         code = _run(given)
         print(end="", flush=True)  # Python's own flush would come too late for an exit code
@@ -143,7 +143,7 @@ def _guard(given: list[str]) -> int:
 
 
 def _run(given: list[str]) -> int:
-    """Run the command that the words name; return its exit code."""
+    """Run the command that the arguments name; return its exit code."""
     if given in ([], ["--version"], ["--help"], ["-h"]):
         print(START if not given else f"torchgrasp {__version__}" if given == ["--version"] else format_help())
         return 0
@@ -163,7 +163,7 @@ def _run(given: list[str]) -> int:
 
 
 def _parser() -> SubcommandApp:
-    """Return the parser of commands; commands of two words are grouped by the first word."""
+    """Return the argument parser of all commands; commands of two words are grouped by the first word."""
     top, groups = SubcommandApp(), dict[str, SubcommandApp]()
     for name, command in COMMANDS.items():
         group, _, last = name.rpartition(" ")
@@ -175,7 +175,7 @@ def _parser() -> SubcommandApp:
 
 
 def format_help() -> str:
-    """Return all commands in chapters, each with its first sentence."""
+    """Return the help text: all commands in chapters, each with its first sentence."""
     lines = ["torchgrasp: dexterous fingertip grasps from a partial point cloud", ""]
     for chapter, words in CHAPTERS.items():
         lines.append(chapter)
@@ -188,7 +188,7 @@ def format_help() -> str:
 
 
 def _sentence(error: GraspError) -> str:
-    """Return an error in one line, with the allowed word that is most like a misspelt one."""
+    """Return an error as one line of text, with a suggestion for a misspelt word."""
     line = " ".join(str(error).split())
     word = str(error.found).strip("'") if isinstance(error, BadArgument) else ""
     if not re.fullmatch(r"[A-Za-z_-]+", word):
@@ -200,7 +200,7 @@ def _sentence(error: GraspError) -> str:
 
 @contextlib.contextmanager
 def _open_streams() -> Iterator[None]:
-    """Replace standard streams that the process was started without, as by a daemon, by the null device.
+    """Replace standard streams that are missing, as in a daemon, by the null device.
 
     Otherwise the first file that is opened gets the descriptor of a stream, and libraries print into the file.
     """
@@ -218,19 +218,19 @@ def _open_streams() -> Iterator[None]:
 
 
 def _drop_stdout() -> None:
-    """Lead stdout to the null device: Python would try to write the rest when it ends."""
+    """Redirect stdout to the null device, because Python would try to flush it at the end."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # stdout may be closed, or no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # pyright: ignore[reportOptionalMemberAccess]
 
 
 class _WithoutMarkup:
-    """A stream that removes tyro's markup, which some messages of tyro show as text."""
+    """An output stream that removes tyro's markup from the text, where tyro prints it literally."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
 
     def write(self, text: str) -> int:
-        """Write the text; the frame around it stays aligned."""
+        """Write the text without markup; a frame around the text stays aligned."""
         room = " " * len("[bold][/bold]")
         return self.stream.write(
             re.sub(r"\[bold\](.*?)\[/bold\](.*?)( │?)$", rf"\1\2{room}\3", text, flags=re.MULTILINE)
@@ -241,7 +241,7 @@ class _WithoutMarkup:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM, which ends a command like SIGINT: workers are stopped, and no half-written file is left."""
+    """Raised on SIGTERM, which ends a command like SIGINT: workers stop, and no half-written file is left."""
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:

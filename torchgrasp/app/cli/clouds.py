@@ -1,4 +1,4 @@
-"""`torchgrasp cloud` and `torchgrasp shape`: check, cut, thin and make clouds and scenes, and the estimated surface."""
+"""The commands `torchgrasp cloud` and `shape`: check, cut, thin and make clouds; write the estimated surface."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -51,7 +51,7 @@ class CloudCheck(Command):
     view: CloudOptions = nested(CloudOptions())
 
     def run(self) -> int:
-        """Print the report."""
+        """Check the cloud and print the report; return the exit code."""
         file = self.view.read("FILE", find_cloud(self.file, "FILE"), whole=True)
         plane = as_plane(self.view.plane(file.cloud))
         up = self.view.vertical if self.view.up is not None or plane is None else plane.normal
@@ -68,7 +68,7 @@ class CloudCheck(Command):
 
 
 def _no_view(cloud: PointCloud) -> BadArgument | None:
-    """Return the error with which the fit of a shape refuses a cloud that no single camera sees; None: no error."""
+    """Return the error for a cloud that no single camera can see, which `fit_shape` rejects; None: no error."""
     some = cloud.select(draw_rows(len(cloud), 20_000))  # more points give no more certainty
     try:
         seen = prepare_cloud(some, torch.Generator().manual_seed(0))
@@ -94,7 +94,7 @@ class CloudCut(Command):
     gap: float = option(0.02, "least distance between two objects [m]")
 
     def run(self) -> int:
-        """Cut the object out and write it."""
+        """Cut the object out of the cloud and write its points; return the exit code."""
         if not 0.001 <= self.gap <= 1.0:
             raise BadArgument("--gap", self.gap, "a number of metres in [0.001, 1]")
         file = self.view.read("CLOUD", self.cloud, whole=True)
@@ -116,7 +116,7 @@ class CloudCut(Command):
 
 @arguments(points="depth", path="out")
 class _DepthCommand(Command):
-    """A command on a depth image."""
+    """The arguments of commands that read a depth image."""
 
     depth: Path = positional(
         'image along the optical axis (.png of 16 bit, .npy, or .npz with an array "depth"): integers are millimetres, '
@@ -134,7 +134,7 @@ class _DepthCommand(Command):
     )
 
     def images(self):
-        """Return the depth image, its mask and the pose of its camera, as far as they are given."""
+        """Return the depth image, the mask and the camera pose; None where not given."""
         mask = None if self.mask is None else read_image("mask", self.mask)
         pose = None if self.camera_pose is None else read_pose("camera_pose", self.camera_pose)
         return read_image("depth", self.depth), mask, pose
@@ -145,7 +145,7 @@ class CloudDepth(_DepthCommand):
     """Write the point cloud of a depth image, with the camera as viewpoint."""
 
     def run(self) -> int:
-        """Write the cloud."""
+        """Convert the depth image and write the cloud; return the exit code."""
         depth, mask, pose = self.images()
         cloud = cloud_from_depth(depth, self.intrinsics, mask, pose)
         save_cloud(cloud, self.out)
@@ -161,7 +161,7 @@ class CloudScene(_DepthCommand):
     out: Path = required("scene to write (.npz); beside it a .png shows the table, objects and obstacles")
 
     def run(self) -> int:
-        """Write the scene."""
+        """Find the table and the objects, write the scene and its picture; return the exit code."""
         picture = self.out.with_suffix(".png")
         if picture.resolve() in [path.resolve() for path in (self.depth, self.mask) if path is not None]:
             raise BadArgument("--out", f"{self.out}, whose picture would replace {picture}", "another name")
@@ -190,7 +190,7 @@ class CloudThin(Command):
     view: ViewOptions = nested(ViewOptions())
 
     def run(self) -> int:
-        """Write the thinned cloud."""
+        """Thin the cloud, remove outliers and write the rest; return the exit code."""
         file = self.view.read("CLOUD", self.cloud, whole=True)
         some = voxel_downsample(file.cloud, self.voxel)
         less = remove_outliers(some)
@@ -214,7 +214,7 @@ class CloudRender(Command):
     seed: Seed = option(0, SEED_HELP)
 
     def run(self) -> int:
-        """Write the cloud."""
+        """Render the mesh by a simulated depth camera and write the cloud; return the exit code."""
         with naming(points="MESH"):
             solid = read_mesh(self.mesh)
             pose = look_at(self.azimuth, self.elevation, self.distance, solid)
@@ -235,7 +235,7 @@ class CloudViews(Command):
     seed: Seed = option(0, SEED_HELP)
 
     def run(self) -> int:
-        """Write the folder."""
+        """Render views of all meshes and write the folder of objects; return the exit code."""
         names = write_objects(self.meshes, self.out, self.views, self.seed)
         print(f"{len(names)} objects with {self.views} view{'s' * (self.views != 1)} each: {self.out}")
         return 0
@@ -255,7 +255,7 @@ class ShapeSurface(Command):
     seed: Seed = option(0, SEED_HELP)
 
     def run(self) -> int:
-        """Fit the shape and write its surface."""
+        """Fit the shape and write its surface as a mesh; return the exit code."""
         check_surface_path(self.out)
         file = self.view.read("CLOUD", find_cloud(self.cloud))
         table = self.view.plane(file.cloud)

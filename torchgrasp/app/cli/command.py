@@ -1,4 +1,4 @@
-"""Commands as frozen values: each field is an argument with its default and its help, and `run` does the work."""
+"""Commands as frozen dataclasses: a field is a command-line argument with default and help; `run` does the work."""
 
 import contextlib
 import dataclasses
@@ -19,39 +19,39 @@ T = TypeVar("T")
 
 
 class Command:
-    """A command of the command line; `names` are fields by the names that errors of the library use for them."""
+    """Base of all commands; `names` maps the argument names in the library's errors to the command's fields."""
 
     names: ClassVar[dict[str, str]] = {}
 
     def run(self) -> int:
-        """Do the work; return the exit code."""
+        """Run the command; return the exit code."""
         raise NotImplementedError
 
 
 def option(default: Any, help: str) -> Any:
-    """Return a field that is an option, `--its-name`."""
+    """Return a dataclass field that is a command-line option, `--its-name`, with a default."""
     return dataclasses.field(default=default, metadata={"help": help})
 
 
 def required(help: str) -> Any:
-    """Return a field that is an option without a default."""
+    """Return a dataclass field that is a required command-line option."""
     return dataclasses.field(metadata={"help": help})
 
 
 def positional(help: str) -> Any:
-    """Return a field that is a positional argument."""
+    """Return a dataclass field that is a positional command-line argument."""
     return dataclasses.field(metadata={"help": help, "positional": True})
 
 
 def nested(default: Any) -> Any:
-    """Return a field whose own fields are options of the command."""
+    """Return a dataclass field whose own fields are options of the command."""
     return dataclasses.field(default=default, metadata={"nested": True})
 
 
 def arguments(**names: str) -> Callable[[type[T]], type[T]]:
-    """Return a decorator that makes a frozen dataclass whose fields are arguments, as tyro shows them.
+    """Return a decorator that turns a class into a frozen dataclass whose fields are command-line arguments.
 
-    `names` are fields by the names that errors of the library use for them.
+    `names` maps the argument names in the library's errors to fields.
     """
 
     def make(cls: type[T]) -> type[T]:
@@ -64,7 +64,7 @@ def arguments(**names: str) -> Callable[[type[T]], type[T]]:
 
 
 def _annotate(field: dataclasses.Field) -> Any:
-    """Return the annotation of a field with its help; the help does not show the defaults None, False and ()."""
+    """Return the annotation of a field with its help text; the defaults None, False and () are not shown."""
     if field.metadata.get("nested"):
         return Annotated[field.type, tyro.conf.arg(name="")]
     text = field.metadata["help"]
@@ -78,7 +78,7 @@ def _annotate(field: dataclasses.Field) -> Any:
 
 
 def _metavar(kind: Any) -> str:
-    """Return the placeholder of a value in the help, as "FLOAT FLOAT" or "{a,b}"."""
+    """Return the placeholder of a value in the help text, such as "FLOAT FLOAT" or "{a,b}"."""
     parts = get_args(kind)
     if get_origin(kind) is Annotated:
         return _metavar(parts[0])
@@ -90,7 +90,7 @@ def _metavar(kind: Any) -> str:
 
 
 def execute(command: Command) -> int:
-    """Check paths and ranges of numbers, and run a command; errors name its options."""
+    """Check paths and number ranges of a command's arguments, then run it; errors name the command-line options."""
     fields = {f.name: f for f in dataclasses.fields(command) if "help" in f.metadata}  # pyright: ignore[reportArgumentType]
     options = {
         name: name.upper() if field.metadata.get("positional") else f"--{name.replace('_', '-')}"
@@ -109,7 +109,7 @@ def execute(command: Command) -> int:
 
 @contextlib.contextmanager
 def naming(**options: str) -> Iterator[None]:
-    """Name options in errors, by the argument for which each is given."""
+    """In errors raised within the context, replace argument names by the names of command-line options."""
     try:
         yield
     except BadArgument as error:
@@ -120,7 +120,7 @@ def naming(**options: str) -> Iterator[None]:
 
 
 class Progress:
-    """A printed line for each stage that ended; on a terminal, a bar names the current stage."""
+    """Progress output: a line for each finished stage, and on a terminal a bar that names the current stage."""
 
     def __init__(self, *names: str) -> None:
         self.next = dict(zip(names, (*names[1:], "done"), strict=True))
@@ -130,7 +130,7 @@ class Progress:
         self.bar = make_bar(len(names), "stage", desc=names[0], delay=1)
 
     def end(self, name: str, message: str, value: Any = None) -> None:
-        """Note the end of a stage."""
+        """Print the line of a finished stage."""
         now = time.perf_counter()
         self.stages.append((name, message, now - self.began))
         self.values[name] = value
@@ -143,5 +143,5 @@ class Progress:
 
 
 def make_bar(total: int | None, unit: str, **options: Any) -> tqdm:
-    """Return a bar with the estimated end; it is silent where stderr is no terminal."""
+    """Return a tqdm progress bar; it is silent if stderr is not a terminal."""
     return tqdm(total=total, unit=unit, disable=None, leave=False, **options)

@@ -1,4 +1,4 @@
-"""`torchgrasp doctor` and `torchgrasp selftest`: is the installation complete, and are its results right?"""
+"""The commands `torchgrasp doctor` and `torchgrasp selftest`: is the installation complete, and does it work?"""
 
 import importlib.metadata
 import importlib.util
@@ -26,7 +26,7 @@ OPTIONAL = {"distributed": ("cluster", "`torchgrasp campaign --scheduler`")}
 
 
 class Finding(NamedTuple):
-    """A part of the installation, its state, and the fix of a fault; "" without a fault."""
+    """One part of the installation, its state, and the fix if something is missing ("" otherwise)."""
 
     part: str
     found: str
@@ -42,7 +42,7 @@ class Doctor(Command):
     """
 
     def run(self) -> int:
-        """Print what was found."""
+        """Print the state of every part, and the fixes; return the exit code."""
         findings = find_parts()
         print(format_columns([(x.part, x.found) for x in findings], left={0, 1}))
         missing = [x for x in findings if x.fix]
@@ -53,7 +53,7 @@ class Doctor(Command):
 
 
 def find_parts() -> list[Finding]:
-    """Return the state of every part."""
+    """Return the state of every part of the installation."""
     return [
         Finding(
             "torchgrasp",
@@ -77,7 +77,7 @@ class Selftest(Command):
     """
 
     def run(self) -> int:
-        """Lift, compare and print."""
+        """Lift the shipped grasps in each simulator, compare the verdicts; return the exit code."""
         from torchgrasp.evaluation.golden import GOLDEN, GoldenResult, run_golden
 
         faults: dict[Simulator, str] = {name: _simulator(name).fix for name in SIMULATORS}
@@ -104,12 +104,12 @@ class Selftest(Command):
 
 
 def _verdict(held: bool) -> str:
-    """Return a verdict in one word."""
+    """Return the verdict on a lift in one word."""
     return "held" if held else "lost"
 
 
 def _package(name: str, fix: str = "pip install torchgrasp") -> Finding:
-    """Return the version of a package."""
+    """Return the installed version of a package as a finding; if it is missing, the `fix`."""
     try:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
@@ -117,21 +117,21 @@ def _package(name: str, fix: str = "pip install torchgrasp") -> Finding:
 
 
 def _option(name: str) -> Finding:
-    """Return the version of a package that only one command needs; a missing one is no fault."""
+    """Return the version of a package that only one command needs; it may be missing."""
     extra, command = OPTIONAL[name]
     found = _package(name)
     return found if not found.fix else Finding(name, f"none; {command} needs it: pip install 'torchgrasp[{extra}]'")
 
 
 def _gpu() -> Finding:
-    """Return the GPU that torch sees; a missing one is no fault."""
+    """Return the GPU that torch can use; a missing GPU is not a fault."""
     if torch.cuda.is_available():
         return Finding("GPU", f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}")
     return Finding("GPU", "none visible to torch; everything runs on the processor")
 
 
 def _simulator(name: Simulator) -> Finding:
-    """Return the version of a simulator that can be imported."""
+    """Return the version of a simulator if it can be imported, otherwise the fix."""
     try:
         import_simulator(name)
     except (MissingExtra, BadArgument) as error:

@@ -1,4 +1,4 @@
-"""`torchgrasp evaluate` and `torchgrasp campaign`: grasps tried in simulation, for shares or for a data set."""
+"""The commands `torchgrasp evaluate` and `campaign`: grasps tried in simulation, for statistics or a data set."""
 
 import dataclasses
 import sys
@@ -28,7 +28,7 @@ Protocol = Literal["multidex", "dexgraspbench", "dexgraspbench-hard", "pose-nois
 
 @arguments(folder="out", path="out")
 class _Trials(Command):
-    """Arguments of trials on a folder of objects."""
+    """Arguments that `evaluate` and `campaign` share: hand, protocol options, grasps and views."""
 
     hand: str = required(HAND_HELP)
     out: Path = required("folder of the results; no other run may use it at the same time")
@@ -43,7 +43,7 @@ class _Trials(Command):
     seed: Seed = option(0, SEED_HELP)
 
     def trial(self, **changes: Any) -> dict[str, Any]:
-        """Return the changes to the trial of a protocol that were asked for."""
+        """Return the changes to a protocol's trial that the user asked for."""
         changes |= {"closing": self.closing, "simulator": self.simulator}
         return {name: value for name, value in changes.items() if value is not None}
 
@@ -66,7 +66,7 @@ class Evaluate(_Trials):
     workers: int = option(1, "processes; the results do not depend on their number")
 
     def run(self) -> int:
-        """Evaluate, and write the results."""
+        """Evaluate the objects, write the results and print the summary; return the exit code."""
         import_simulator(self.simulator)
         hand, among = load_fingers(self.hand, self.fingers)
         test = find_protocol(self.protocol).with_trial(**self.trial(force=self.force, holding=self.holding))
@@ -99,7 +99,7 @@ class Evaluate(_Trials):
 
 
 def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
-    """Return the object and the name of each view; an object without views has the view ""."""
+    """Return pairs of object and view for all views; an object without views has the view ""."""
     names = []
     for name, entry in read_entries(objects, spec.only).items():
         bad = isinstance(entry, DatasetError)  # a bad entry is refused when it is evaluated
@@ -109,7 +109,7 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
 
 
 def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
-    """Print the line of a view, with columns of these widths for its names."""
+    """Print one line for a view; `widths` are the column widths of object and view."""
     failed = [attempt.status for attempt in score.attempts if attempt.status is not Status.OK]
     reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
@@ -119,7 +119,7 @@ def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
 
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
-    """Print shares, those of each group of objects, failures by stage, and cost."""
+    """Print success rates, also for each group of objects, failures by stage, and computing time."""
     rows = [(text, format_share(summary[key])) for key, text in SHARE_NAMES.items()]
     for name, group in summary["by_group"].items():
         rows += [(f"{name}: {text}", format_share(group[key])) for key, text in SHARE_NAMES.items()]
@@ -161,7 +161,7 @@ class Campaign(_Trials):
     scheduler: str | None = option(None, "Dask scheduler, as tcp://10.0.0.1:8786, whose workers do the jobs instead")
 
     def run(self) -> int:
-        """Run the campaign and print its counts."""
+        """Run the campaign and print its counts; return the exit code."""
         import_simulator(self.simulator)
         if self.fingers == "auto":
             raise BadArgument("--fingers", "auto", "one set of fingers for all records")
@@ -190,7 +190,7 @@ class Campaign(_Trials):
 
 
 def print_job(row: JobRow) -> None:
-    """Print the line of a finished job."""
+    """Print one line for a finished job."""
     reason = "" if row.status is Status.OK else row.note or row.status.sentence
     numbers = row.executable, f"{row.passed}/{row.grasps}"
     print(format_line((row.object, row.view, *numbers, reason), (-12, -6, 5, 7, -1)), flush=True)

@@ -1,4 +1,4 @@
-"""`torchgrasp export` and `torchgrasp import`: grasps in the formats of other programs, written and read."""
+"""The commands `torchgrasp export` and `torchgrasp import`: grasps in the formats of other programs."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -55,7 +55,7 @@ class Export(Command):
     object: str | None = option(None, "dexgraspbench: its folder of the object; graspgen: the mesh in its data set")
 
     def run(self) -> int:
-        """Write the grasps."""
+        """Load the grasps and write them in the chosen format; return the exit code."""
         if (self.object is None) == (self.format in ("dexgraspbench", "graspgen")):
             wanted = "a path with --format dexgraspbench or graspgen, and with these alone"
             raise BadArgument("--object", self.object, wanted)
@@ -97,7 +97,7 @@ class Import(Command):
     std: float = option(0.003, "standard deviation of the surface [m] that a closing assumes at each contact")
 
     def run(self) -> int:
-        """Read, certify and write the grasps."""
+        """Read the grasps of another program, certify and write them; return the exit code."""
         hand, _ = load_fingers(self.hand, self.fingers)
         with naming(path="FILE"):
             read = read_foreign(self.file, hand, self.joints, self.quaternion)

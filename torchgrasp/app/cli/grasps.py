@@ -1,4 +1,4 @@
-"""`torchgrasp grasp`, which plans grasps of an object in a cloud or a scene; `objects` and `view`."""
+"""The commands `torchgrasp grasp`, which plans grasps of an object in a cloud or a scene, `objects` and `view`."""
 
 import dataclasses
 import webbrowser
@@ -89,7 +89,7 @@ class Grasp(Command):
     no_report: bool = option(False, "write the grasps without the pages")
 
     def run(self) -> int:
-        """Plan, close if asked, and write the results."""
+        """Plan grasps, close on the object if asked, and write the results; return the exit code."""
         path = find_cloud(self.cloud)
         out = Path("out") / object_name(path) if self.out is None else self.out
         check_folder(out)
@@ -99,7 +99,7 @@ class Grasp(Command):
         return self._grasp_scene(path, out, hand, among) if scene else self._grasp_cloud(path, out, hand, among)
 
     def _check_choice(self, scene: bool) -> None:
-        """Refuse options that do not fit a cloud or a scene."""
+        """Raise `BadArgument` for options of a scene with a cloud, or of a cloud with a scene."""
         if scene:
             if self.label is not None and self.point is not None:
                 raise BadArgument("--point", "--label beside it", "one of the two")
@@ -113,7 +113,7 @@ class Grasp(Command):
             raise BadArgument("--time-budget", self.time_budget, "at least 0.001 seconds")
 
     def _grasp_cloud(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
-        """Plan on a cloud."""
+        """Plan on a point cloud and write the results; return the exit code."""
         mesh = self._true_mesh(path)
         file = self.view.read("CLOUD", path)
         cloud, table = file.cloud, self.view.plane(file.cloud)
@@ -148,7 +148,7 @@ class Grasp(Command):
         return 0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
 
     def _true_mesh(self, path: Path) -> Path | None:
-        """Return the mesh to close on; a shipped object has one. Check that the simulator can be loaded."""
+        """Return the path of the true mesh for the simulated closing; None: no closing."""
         shipped = path != self.cloud  # the cloud is given by name
         mesh = path.with_name("mesh.ply") if shipped and self.close and self.mesh is None else self.mesh
         if self.close and mesh is None:
@@ -158,7 +158,7 @@ class Grasp(Command):
         return mesh
 
     def _grasp_scene(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
-        """Plan for an object in a scene: the chosen one, or the easiest."""
+        """Plan for the chosen object of a scene, or the easiest, and write the results; return the exit code."""
         spec, choice = ContactSpec(friction=self.friction), self.point if self.label is None else self.label
         names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
         with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
@@ -189,7 +189,7 @@ class Grasp(Command):
         return 0 if print_grasps(run) else 1
 
     def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):
-        """Plan for the objects of a scene until one is easy; return the scene with it as target, grasps and shape."""
+        """Plan for the objects of a scene until one is easy; return the scene with this target, grasps and shape."""
         # An object with this predicted success is easy enough: the others are not tried.
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9)
         for thing in plan.things:
@@ -207,7 +207,7 @@ STAGES = ("shape", "plan", "certify", "query", "refine")  # stages of planning, 
 
 
 def write_results(out: Path, run: Run, no_report: bool) -> str:
-    """Write the grasps of a run, and its pages if wanted; return the paths as text."""
+    """Write the grasps of a run, and its HTML pages unless `no_report`; return the paths as text."""
     paths = [out / "grasps.safetensors"]
     run.grasps.save(paths[0])
     if not no_report:
@@ -231,7 +231,7 @@ class View(Command):
     no_browser: bool = option(False, "only print the address")
 
     def run(self) -> int:
-        """Print the address of the page and open it."""
+        """Print the address of the 3D page and open it in the browser; return the exit code."""
         page = (self.folder if self.folder.is_dir() else self.folder.parent) / VIEW
         if not page.is_file():
             wanted = "a folder that `torchgrasp grasp` wrote with a report"
@@ -247,7 +247,7 @@ class Objects(Command):
     """List the shipped objects, each with a noisy view and a true mesh."""
 
     def run(self) -> int:
-        """Print names, masses and files."""
+        """Print name, mass and files of each shipped object; return the exit code."""
         for name in list_objects():
             folder = DATA / name
             print(f"{name} ({MASSES[name]:g} kg)\n  view: {folder / 'view.ply'}\n  mesh: {folder / 'mesh.ply'}")
@@ -255,7 +255,7 @@ class Objects(Command):
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Read the closed mesh of --mesh, with the convex parts of a shipped object."""
+    """Read the closed mesh of --mesh; for a shipped object also return its convex parts."""
     with naming(path="--mesh", mesh="--mesh"):
         mesh, digest = read_mesh(path), sha256(path)
     for name in list_objects():

@@ -1,4 +1,4 @@
-"""`torchgrasp hand check`: every fault of a hand by name, warnings with their fixes, a picture, and a trial."""
+"""The command `torchgrasp hand check`: faults of a hand, warnings with fixes, a picture, and a trial plan."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ class HandCheck(Command):
     out: Path = option(Path("hand.png"), "picture to write (.png): the pads, the frame of the palm, the limits")
 
     def run(self) -> int:
-        """Check, describe, draw and try the hand."""
+        """Check, describe and draw the hand, and plan on a shipped object; return the exit code."""
         if self.out.suffix.lower() != ".png":
             raise BadArgument("--out", self.out, "a file ending in .png")
         chosen = "default" if self.fingers == "auto" else self.fingers
@@ -54,7 +54,7 @@ class HandCheck(Command):
             for one in hands:
                 bar.set_description(f"postures of {one.source.option}")
                 for warning in find_warnings(one, random_joints(one, len(joints))):
-                    bar.write(f"doubtful: {one.source.option}: {warning}")
+                    bar.write(f"warning: {one.source.option}: {warning}")
                 bar.update()
             write_file(self.out, draw_hand(sound, opposed_posture(sound, joints)))
             bar.write(f"picture: {self.out}")
@@ -69,7 +69,7 @@ class HandCheck(Command):
 
 
 def print_faults(hand: str | Path, fingers: str = "default") -> bool:
-    """Print every fault of a hand with these fingers and every set that it declares; return whether there is one."""
+    """Print every fault of a hand, for the given fingers and all declared sets; return whether there is any."""
     try:
         options = read_hand_toml(find_hand(hand) / "hand.toml", fingers).options
         faults: list[GraspError] = [fault for some in (fingers, *options) for fault in find_faults(hand, some)]
@@ -83,13 +83,13 @@ def print_faults(hand: str | Path, fingers: str = "default") -> bool:
 
 
 def describe_sets(hand: Hand) -> str:
-    """List the sets of fingers that a hand declares."""
+    """Return a text that lists the sets of fingers that a hand declares."""
     rows = [(one.source.option, ", ".join(one.finger_names)) for one in finger_sets(hand, "auto")]
     return f"sets of fingers:\n{format_columns(rows, left={0, 1})}"
 
 
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
-    """Return warnings on a sound hand, judged by random postures `joints` (n, h) [rad], each with its fix."""
+    """Return warnings about a hand without faults, each with its fix, from random postures (n, h) [rad]."""
     # Least shares of random postures that are free, face a pad to the others, and can hold an object; three fingers
     least_free, least_facing, least_closing = 0.2, 0.02, 0.001
     warnings, free, named = [], hand.self_clearance(joints) > 0, f"[options.{hand.source.option}]"
@@ -118,7 +118,7 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
 
 
 def _try_objects(hand: Hand, bar: tqdm) -> bool:
-    """Plan on shipped objects until one is graspable; return whether one is."""
+    """Plan on the shipped objects until one is graspable; return whether any is."""
     for name in ("cylinder", "jug"):
         grasps = plan_grasps(load_object(name).view, hand, starts=TRIAL_STARTS)
         count = count_status(grasps.status)
@@ -132,7 +132,7 @@ def _try_objects(hand: Hand, bar: tqdm) -> bool:
 
 
 def describe(hand: Hand, joints: torch.Tensor) -> str:
-    """Describe a hand: its joints, its fingers, and its random postures `joints` (n, h) [rad]."""
+    """Return a text about a hand: its joints, its fingers, and statistics of random postures (n, h) [rad]."""
     tips = hand.tips
     lines = [f"{hand.name}, option {hand.source.option}: {hand.dof} actuated of {len(hand.tree.joint_names)} joints"]
     for name, low, high in zip(hand.joint_names, hand.lower.rad2deg(), hand.upper.rad2deg(), strict=True):

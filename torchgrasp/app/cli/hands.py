@@ -1,4 +1,4 @@
-"""`torchgrasp hand`: a draft of hand.toml for any URDF, random postures, and the posture model."""
+"""The commands `torchgrasp hand new`, `sample` and `train`: a first hand.toml, random postures, the posture model."""
 
 import dataclasses
 import time
@@ -40,7 +40,7 @@ class HandNew(Command):
     seed: Seed = option(0, "random seed of the postures from which pads and pairs are guessed")
 
     def run(self) -> int:
-        """Draft, check and write the files of the hand."""
+        """Draft, check and write the files of the hand; return the exit code."""
         folder = self.urdf.parent if self.out is None else self.out
         check_folder(folder)
         clean = "hand.urdf" if (folder / "hand.urdf").resolve() != self.urdf.resolve() else "hand_clean.urdf"
@@ -84,7 +84,7 @@ class HandSample(Command):
     seed: Seed = option(0, SEED_HELP)
 
     def run(self) -> int:
-        """Sample and write."""
+        """Draw random postures and write them; return the exit code."""
         hand, _ = load_fingers(self.hand, self.fingers)
         begin = time.perf_counter()
         spec = SampleSpec(self.n, self.seed, self.sampling)
@@ -109,7 +109,7 @@ class HandTrain(Command):
     out: Path | None = option(None, "file to write; by default mixture.safetensors in the hand's folder")
 
     def run(self) -> int:
-        """Train and write the model."""
+        """Sample postures, fit and evaluate the model, and write it; return the exit code."""
         if self.out is not None and self.out.suffix != ".safetensors":
             raise BadArgument("--out", self.out, "a file ending in .safetensors")
         hand = check_hand(self.hand)
@@ -148,7 +148,7 @@ class HandTrain(Command):
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:
-    """Return the number of Gaussians with the least BIC, on postures that the fit does not use; print the curve."""
+    """Return the number of Gaussians with the least BIC on separate random postures; print the BIC curve."""
     candidates = range(5, 61, 5)  # as in Fig. 6
     apart = sample_configurations(hand, 40_000, seed + 1, workers, "grasping")
     with make_bar(len(candidates), "fit", desc="components") as bar:

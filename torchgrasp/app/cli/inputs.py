@@ -1,4 +1,4 @@
-"""Arguments that several commands share: how a file of a cloud is read, the table, the hand, and output folders."""
+"""Arguments that several commands share: reading of cloud files, the table, the hand, and output folders."""
 
 import contextlib
 import importlib
@@ -41,7 +41,7 @@ SEED_HELP = "random seed"
 
 @arguments()
 class ViewOptions:
-    """How the file of a cloud is read."""
+    """Options for reading the file of a cloud: camera, normals, unit, vertical."""
 
     viewpoint: tuple[float, float, float] | None = option(
         None, "position of the camera [m] in the frame of the cloud; by default the file's, else an estimate"
@@ -58,7 +58,7 @@ class ViewOptions:
 
     @property
     def vertical(self) -> Tensor | None:
-        """The vertical, of unit length; None: z."""
+        """The vertical as a unit vector; None: z."""
         if self.up is None:
             return None
         vector = check_tensor("--up", torch.tensor(self.up, dtype=torch.float64), (3,))
@@ -67,7 +67,7 @@ class ViewOptions:
         return unit(vector)
 
     def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
-        """Read the cloud of an argument; `whole` accepts scenes of any size and keeps all points."""
+        """Read the cloud of an argument `name`; `whole` accepts scenes of any size and keeps all points."""
         if self.viewpoint is not None and (self.no_viewpoint or self.camera_pose is not None):
             raise BadArgument("--viewpoint", "--no-viewpoint or --camera-pose beside it", "one of them")
         with naming(path=name, points=name, normals=name, viewpoint="--viewpoint"):
@@ -90,7 +90,7 @@ class ViewOptions:
 
 @arguments()
 class CloudOptions(ViewOptions):
-    """How the file of a cloud is read, and where the table is."""
+    """Options for reading the file of a cloud, and for the table."""
 
     table: tuple[float, ...] | None = option(
         None,
@@ -100,7 +100,7 @@ class CloudOptions(ViewOptions):
     no_table: bool = option(False, "there is no table")
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
-        """Return the table: a plane, or its height [m] along z."""
+        """Return the table as a plane, as a height [m] along z, or None."""
         table = self.table
         if table is not None and self.no_table:
             raise BadArgument("--table", f"{' '.join(f'{x:g}' for x in table)} and --no-table", "one of the two")
@@ -125,7 +125,7 @@ class CloudOptions(ViewOptions):
         return height if up is None else Plane(up, height)
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
-        """Return advice on the cloud of CLOUD; refuse a cloud on which no grasp should be planned."""
+        """Return advice on the quality of a cloud; raise `BadArgument` if no grasp should be planned on it."""
         plane = as_plane(table)
         up = self.vertical if self.up is not None or plane is None else plane.normal
         with naming(points="CLOUD", normals="CLOUD"):
@@ -137,7 +137,7 @@ class CloudOptions(ViewOptions):
 
 
 def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
-    """Move a cloud out of its camera's frame."""
+    """Return a cloud moved from the camera's frame to the frame of the pose."""
     widest = 1.5  # tangent of half an angle of view wider than that of depth cameras
     unseen = float((cloud.points[:, :2].abs().amax(1) >= widest * cloud.points[:, 2]).double().mean())
     if unseen > 0.01:
@@ -149,7 +149,7 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
 
 
 def find_cloud(path: Path, name: str = "CLOUD") -> Path:
-    """Return the file of a cloud; the name of a shipped object stands for its noisy view."""
+    """Return the path of a cloud; the name of a shipped object gives its noisy view."""
     names = list_objects()
     if path.exists() or path.suffix or len(path.parts) != 1:
         return path
@@ -159,13 +159,13 @@ def find_cloud(path: Path, name: str = "CLOUD") -> Path:
 
 
 def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...] = ()) -> None:
-    """Print notes on how a file was read, and advice."""
+    """Print notes on how a file was read, and advice on the cloud."""
     for name, sentence in [*(("note", n) for n in notes), *(("advice", str(a)) for a in advice)]:
         print(f"{name:8}{sentence}")
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder that cannot be written, by writing a temporary file."""
+    """Raise `OutputError` if a folder cannot be written, by a test with a temporary file."""
     made: list[Path] = []
     try:
         for folder in reversed([path, *path.parents]):
@@ -186,7 +186,7 @@ def check_folder(path: Path) -> None:
 def holding(
     name: str, path: Path | None, hold: Callable[[Path], AbstractContextManager[None]] = hold_folder
 ) -> Iterator[None]:
-    """Hold the folder, or file, of an option against other runs; None: nothing."""
+    """Lock the folder, or file, of an option against other runs within the context; None: no lock."""
     with contextlib.ExitStack() as held:
         if path is not None:
             with naming(folder=name, path=name):
@@ -195,13 +195,13 @@ def holding(
 
 
 def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:
-    """Load the hand of --hand with --fingers; return the hand, and "auto" if its sets of fingers are to be compared."""
+    """Load the hand of --hand with --fingers; also return "auto" if its sets of fingers are to be compared."""
     with naming(hand="--hand", name="--hand", name_or_path="--hand", fingers="--fingers"):
         return (load_hand(hand), "auto") if fingers == "auto" else (load_hand(hand, fingers), None)
 
 
 def describe_table(table: Plane | float) -> str:
-    """Say where the table is."""
+    """Return a text that says where the table is."""
     if isinstance(table, Plane):
         x, y, z = (0.0 + round(n, 3) for n in table.normal.tolist())
         return f"table at {table.offset:.3f} m along ({x:g}, {y:g}, {z:g})"
@@ -209,14 +209,14 @@ def describe_table(table: Plane | float) -> str:
 
 
 def object_name(path: Path) -> str:
-    """Return the name of an object: that of its file, or of its folder where the file has a name of docs/data.md."""
+    """Return a name for the object of a file: the name of the file, or of its folder for a generic file name."""
     if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
         return path.resolve().parent.name or "object"
     return f"object in {path.name}" if path.stem in ("cloud", "model", "points", "scan") else path.stem
 
 
 def import_simulator(name: Simulator = "sapien") -> None:
-    """Import a simulator; refuse one that cannot be loaded."""
+    """Import a simulator; raise an error if it is missing or cannot be loaded."""
     if importlib.util.find_spec(name) is None:
         raise MissingExtra(name, "sim" if name == "sapien" else name)
     try:

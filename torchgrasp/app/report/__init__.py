@@ -1,4 +1,4 @@
-"""Pages and pictures of runs and evaluations, drawn without a display and without OpenGL."""
+"""HTML pages and pictures of runs and evaluations, drawn without a display or OpenGL."""
 
 from torchgrasp.app.report.evaluation import write_evaluation
 from torchgrasp.app.report.page import write_report

@@ -1,4 +1,4 @@
-"""Colours that all pictures share, and the canvas of a still, which collects shapes, frames them and renders them."""
+"""Common colours of all pictures, and the canvas that collects shapes and renders them to a picture."""
 
 import io
 
@@ -23,7 +23,7 @@ SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a p
 
 
 class Canvas:
-    """The shapes of one still."""
+    """A collection of shapes that is rendered to one picture."""
 
     def __init__(self) -> None:
         self.solid: list[Triangles] = []
@@ -37,7 +37,7 @@ class Canvas:
         normals: Float[np.ndarray, "v 3"] | None = None,
         transparent: bool = False,
     ) -> None:
-        """Add a mesh with one colour, or one colour a vertex; without `normals`, edges with a large bend are sharp."""
+        """Add a mesh with one colour, or a colour for each vertex; without `normals` large bends give sharp edges."""
         corners = vertices[faces]
         bent = _sharp_normals(vertices, faces) if normals is None else normals[faces]
         shade = np.broadcast_to(rgb(color), corners.shape) if isinstance(color, str) else color[faces]
@@ -80,7 +80,7 @@ class Canvas:
                 self.add_mesh(length * np.asarray(part.vertices) @ axes + start, np.asarray(part.faces), color)
 
     def add_table(self, corners: Float[np.ndarray, "n 3"], height: float | None) -> None:
-        """Add an unlit round table top under `corners` at a height [m]; None: no table."""
+        """Add a round table top, without shading, under `corners` at a height [m]; None: no table."""
         if height is None:
             return
         center = np.append((corners[:, :2].min(0) + corners[:, :2].max(0)) / 2, height - 1e-3)
@@ -92,7 +92,7 @@ class Canvas:
         self.solid.append(Triangles(corners, normals, shade, np.zeros(len(corners), dtype=bool)))
 
     def render(self, camera: Camera, size: tuple[int, int] = SIZE) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the picture that a camera sees, in pixels."""
+        """Return the picture that a camera sees, as pixels."""
         return render(concatenate(self.solid), concatenate(self.transparent), camera, size, rgb(PAPER))
 
     def render_png(
@@ -100,7 +100,7 @@ class Canvas:
     ) -> bytes:
         """Return a PNG that shows all `corners` [m], seen from a direction between 15 and 40 degrees above the table.
 
-        `bar` is the title, the largest value and the colour map of a colour bar at the bottom.
+        `bar` gives the title, the largest value and the colour map of a colour bar at the bottom.
         """
         from PIL import Image
 
@@ -113,7 +113,7 @@ class Canvas:
 def frame_camera(
     corners: Float[np.ndarray, "n 3"], direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE
 ) -> Camera:
-    """Return a camera that sees all `corners`; `drop` is the share of the picture that stays empty at the bottom."""
+    """Return a camera that sees all `corners`; the fraction `drop` of the picture at the bottom stays empty."""
     angle = np.deg2rad(24.0)  # a long lens distorts little
     x, y, z = direction
     flat = float(np.hypot(x, y))
@@ -135,7 +135,7 @@ def frame_camera(
 
 
 def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
-    """Return for each corner of a face the mean normal of the faces there that bend by less than 40 degrees."""
+    """Return a normal for each corner of each face: the mean of adjacent faces that bend by less than 40 degrees."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     weighted = np.cross(b - a, c - a)  # its length is twice the area of the face
     flat = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
@@ -155,13 +155,13 @@ def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Flo
 
 
 def rgb(color: str) -> tuple[float, float, float]:
-    """Return red, green and blue of "#rrggbb" in [0, 1]."""
+    """Return red, green and blue in [0, 1] of a colour "#rrggbb"."""
     red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
     return red, green, blue
 
 
 def map_colors(values: Float[np.ndarray, " n"], name: str) -> Float[np.ndarray, "n 3"]:
-    """Return the colours of values in [0, 1] by a colour map of matplotlib."""
+    """Return the colours of values in [0, 1], by a matplotlib colour map."""
     import matplotlib
 
     return matplotlib.colormaps[name](values)[:, :3]
@@ -184,7 +184,7 @@ def draw_bar(image: object, title: str, most: float, colors: str) -> None:
 
 
 def encode_png(image: object) -> bytes:
-    """Return a picture of Pillow as a PNG."""
+    """Return a Pillow image as the bytes of a PNG."""
     from PIL import Image
 
     assert isinstance(image, Image.Image)

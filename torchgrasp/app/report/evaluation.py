@@ -1,4 +1,4 @@
-"""The page of an evaluation: shares with intervals, and failures."""
+"""The HTML page of an evaluation: success rates with intervals, and failures."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], 
 
 
 def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> str:
-    """Return the page of an evaluation as text."""
+    """Return the HTML page of an evaluation."""
     summary = summarise(scores)
     groups = {"": summary} | {f"{group}: ": some for group, some in summary["by_group"].items()}
     most = max((n for reasons in summary["failures"].values() for n in reasons.values()), default=1)
@@ -83,7 +83,7 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
 
 
 def draw_bar(share: Share, width: int = 180) -> Any:
-    """Return a share in SVG: a mark on a bar [pixels], and the interval, if there is one, as a line."""
+    """Return a success rate as SVG: a mark on a bar, and its interval as a line; `width` in pixels."""
     from markupsafe import Markup
 
     value, low, high = (4 + (width - 8) * x for x in share[:3])
@@ -95,14 +95,14 @@ def draw_bar(share: Share, width: int = 180) -> Any:
 
 
 def swatch(share: float) -> Any:
-    """Return a bar in HTML whose length is a share of 160 pixels."""
+    """Return an HTML bar whose length is a fraction of 160 pixels."""
     from markupsafe import Markup
 
     return Markup(f'<span class="swatch" style="width:{160 * share:.0f}px"></span>')
 
 
 def _share_cells(share: Share, digits: int) -> tuple[str, ...]:
-    """Return a share in numbers and drawn."""
+    """Return table cells for a success rate: value, drawing, interval and number of trials."""
     value, low, high = ("-" if math.isnan(x) else f"{x:.{digits}%}" for x in share[:3])
     return value, draw_bar(share), f"{low} to {high}" if share.units > 1 else "-", str(share.total)
 
@@ -110,7 +110,7 @@ def _share_cells(share: Share, digits: int) -> tuple[str, ...]:
 def _object_rows(
     scores: Sequence[ViewScore], views: Sequence[str], by_object: Mapping[str, Any]
 ) -> list[tuple[str, ...]]:
-    """Return a row for each object: its shares of passed trials, and the outcome of each view."""
+    """Return a table row for each object: its success rates, and the outcome of each view."""
     outcome = {}
     for score in scores:
         passed = f"{sum(attempt.passed for attempt in score.attempts)} / {len(score.attempts)}"
@@ -124,7 +124,7 @@ def _object_rows(
 
 
 def _figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return forces, overlap and times in words."""
+    """Return table rows with mean forces, overlaps and computing times."""
     names = {
         "force_n": ("mean normal force of a finger [N]", ".2f"),
         "overlap_mm": ("overlap of hand and object at the grasp, mean [mm]", ".1f"),

@@ -1,4 +1,4 @@
-"""A film strip of a closing as one PNG: stills of its moments above plots of forces, sliding and motion over time."""
+"""A film strip of a simulated closing as one PNG: pictures of its key moments above plots over time."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +34,7 @@ LETTERS = "abcdef"  # names of the moments in stills and plots
 
 
 def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction) -> bytes:
-    """Draw a closing on the true object; all stills are in the frame of the hand.
+    """Draw the film strip of a closing on the true object; all pictures are in the hand's frame.
 
     Args:
         mesh: the true object [m], in the frame of the grasp, where z is up.
@@ -58,7 +58,7 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
 
 
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
-    """Return the caption of a film: the order of touch, and when and why the object was lost."""
+    """Return the caption of a film strip: the order of touch, and when and why the object was lost."""
 
     def times(count: int) -> str:
         return "once" if count == 1 else f"{count} times"
@@ -73,12 +73,12 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
 
 
 def _color(moment: Moment) -> str:
-    """Return the colour of a moment."""
+    """Return the colour for a moment's title and line."""
     return ALARM if moment.name == LOST else INK
 
 
 def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:
-    """Return the centre of mass [m]."""
+    """Return the centre of mass of a mesh [m]."""
     return torch.tensor(np.array(mesh.center_mass), dtype=torch.float64)
 
 
@@ -90,7 +90,7 @@ def _draw_stills(
     direction: Direction,
     size: tuple[int, int],
 ) -> list[np.ndarray]:
-    """Return the pictures at some ticks, all at one scale."""
+    """Return pictures of the hand and the object at the given ticks, all at the same scale."""
     finite = torch.nonzero(closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1))[:, 0]
     at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
     links = to_array(link_poses(hand, closure.joints[at], closure.joint_names, closure.hand_pose[at]))
@@ -116,7 +116,7 @@ def _draw_stills(
 
 
 def _draw_plots(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, moments: list[Moment]) -> "Image":
-    """Draw forces, blends and sliding of the fingertips, and motions, over the same time."""
+    """Draw plots of fingertip forces, blends and sliding, and of motions, over a common time axis."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL import Image
@@ -144,7 +144,7 @@ def _draw_plots(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, mom
 
 
 def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[Any]) -> None:
-    """Draw lines in axes from 0 to `top`; the title of a plot with a legend ends with a colon."""
+    """Draw one plot from 0 to `top`; a title that ends with a colon means a legend."""
     axis.set(xlim=(time[0], max(time[-1], time[0] + 0.1)), ylim=(0.0, top), facecolor=PAPER)
     axis.set_title(title, loc="left", color=INK, fontsize=13, pad=9)
     axis.grid(axis="y", color=GRID)
@@ -160,7 +160,7 @@ def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[
 
 
 def _list_plots(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> list[tuple[str, float, list[Any]]]:
-    """Return title, upper end of the axis and lines of each plot; a title with a colon has a legend."""
+    """Return title, upper end of the axis, and lines of each plot."""
     trace, names, order = closure.trace, hand.tips.names, closure.contact_order
     ranks = [f"{order.index(k) + 1}. {name}" if k in order else f"never: {name}" for k, name in enumerate(names)]
     distance, turn = moved_in_hand(closure, _centre(mesh))

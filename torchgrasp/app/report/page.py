@@ -1,4 +1,4 @@
-"""The report of one run as an HTML page with pictures, and the template engine of all pages."""
+"""The HTML report of one run with pictures, and the template engine of all pages."""
 
 import base64
 import functools
@@ -37,12 +37,12 @@ GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle d
 
 @checked
 def write_report(path: Path | str, run: Run, view: str = "") -> Path:
-    """Write a run with its pictures as one HTML file, atomically.
+    """Write the report of a run, with its pictures, as one HTML file, atomically.
 
     Args:
         path: file to write.
         run: the run to show.
-        view: name of the page beside the report that `write_viewer` wrote; the report links to the page.
+        view: file name of the 3D page that `write_viewer` wrote beside the report, for a link.
 
     Returns:
         The path of the file.
@@ -64,7 +64,7 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
 
 
 def draw_pictures(run: Run) -> Sections:
-    """Draw every picture of a run: captions and PNGs by section."""
+    """Draw all pictures of a run; return captions and PNGs by section."""
     run = run.upright()
     table = None if run.spec.table is None else 0.0
     view, best = view_of(run.cloud), run.executable
@@ -97,7 +97,7 @@ def draw_pictures(run: Run) -> Sections:
 
 
 def format_page(run: Run, pictures: Sections, view: str = "") -> str:
-    """Return the page of a run as text, with a link to its `view`."""
+    """Return the HTML report of a run, with a link to its 3D page `view`."""
     explanation, outcomes = run.explanation, []
     if run.plan is not None:
         outcomes.append(("Outcome of every initial guess", run.plan.status))
@@ -153,7 +153,7 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 
 @functools.cache
 def templates() -> "jinja2.Environment":
-    """Return the templates of all pages; every text in them is escaped."""
+    """Return the template environment of all pages; every inserted text is escaped."""
     import jinja2
 
     loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
@@ -163,13 +163,13 @@ def templates() -> "jinja2.Environment":
 
 
 def render(template: str, **values: Any) -> str:
-    """Return a page; a value of `markupsafe.Markup` is HTML already."""
+    """Return a page from a template and values; values of type `markupsafe.Markup` are inserted as HTML."""
     return templates().get_template(template).render(values)
 
 
 def format_table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Collection[int] = (), code: Collection[int] = ()
 ) -> str:
-    """Return a table in HTML with columns of `numbers` and of `code`."""
+    """Return an HTML table; `numbers` and `code` are the indices of columns with numbers and code."""
     module: Any = templates().get_template("table.html").module
     return module.table(heads, rows, numbers, code)

@@ -1,4 +1,4 @@
-"""A software renderer in NumPy: triangles to pixels without OpenGL and its system libraries."""
+"""A software renderer in NumPy: triangles to pixels, without OpenGL."""
 
 from typing import NamedTuple
 
@@ -24,11 +24,11 @@ class Camera(NamedTuple):
 
 
 class _Screen(NamedTuple):
-    """Triangles on the screen [samples].
+    """Triangles projected to the screen, in samples.
 
-    `start` is the first corner. Sample centres are covered in the rows from `first` to before `last`. `edges` are
-    the long, the upper and the lower side, each by its upper end and its slope over the rows. `planes` are the inverse
-    distance and the colour over the distance: the values at the first corner, and their gradients.
+    `start` is the first corner. A triangle covers sample centres in the rows from `first` to before `last`. `edges` are
+    its long, upper and lower side, each as upper end and slope over the rows. `planes` are the inverse distance, and
+    the colour over the distance: values at the first corner, and gradients.
     """
 
     start: Float[np.ndarray, "t 2"]
@@ -39,7 +39,7 @@ class _Screen(NamedTuple):
 
 
 def concatenate(parts: list[Triangles]) -> Triangles:
-    """Return the triangles of several sets, or of none, as one set."""
+    """Return several sets of triangles, or none, as one set."""
     empty = np.zeros((0, 3, 3))
     none = Triangles(empty, empty, empty, np.zeros(0, dtype=bool))
     return Triangles(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
@@ -52,7 +52,7 @@ def render(
     size: tuple[int, int],
     background: tuple[float, float, float],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture of opaque triangles under the nearest layer of half-transparent triangles."""
+    """Return the picture of opaque triangles, with the nearest layer of half-transparent triangles over them."""
     samples = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
     width, height = size[0] * samples, size[1] * samples
     image = np.tile(np.array(background, dtype=np.float32), (height * width, 1))
@@ -67,7 +67,7 @@ def render(
 
 
 def _project(triangles: Triangles, camera: Camera, width: int, height: int) -> _Screen:
-    """Return the places of triangles on the screen, and their lit colours."""
+    """Return triangles projected to the screen of a camera, with their lit colours."""
     local = (triangles.corners - camera.position) @ camera.frame.T
     near = 1.0 / np.maximum(-local[..., 2], 1e-6)  # the scene is framed in front of the camera
     focal = height / 2 / np.tan(camera.angle / 2)
@@ -95,7 +95,7 @@ def _project(triangles: Triangles, camera: Camera, width: int, height: int) -> _
 
 
 def _cast(screen: _Screen, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the covered samples, and the inverse distance (k,) and colour (k, 3) of the nearest triangle there."""
+    """Return the covered samples, with inverse distance (k,) and colour (k, 3) of the nearest triangle at each."""
     owner, row = _ranges(screen.first, screen.last)
     middle = row + 0.5
     short = np.where(middle < screen.edges[owner, 2, 1], 1, 2)
@@ -123,7 +123,7 @@ def _cast(screen: _Screen, width: int, height: int) -> tuple[np.ndarray, np.ndar
 
 
 def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return for each integer of the ranges [begin, end) the index of its range, and the integer."""
+    """Return all integers of the ranges [begin, end), each with the index of its range."""
     counts = np.maximum(end - begin, 0)
     owner = np.repeat(np.arange(len(begin)), counts)
     start = np.cumsum(counts) - counts
@@ -131,7 +131,7 @@ def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], 
 
 
 def _shade(triangles: Triangles, camera: Camera) -> Float[np.ndarray, "t 3 3"]:
-    """Light the corners by two lamps fixed to the camera, on the side of each triangle that the camera sees."""
+    """Return the colours of the corners, lit by two lamps fixed to the camera."""
     ambient, key_strength, fill_strength, shine_strength = 0.52, 0.50, 0.22, 0.08  # chosen by eye, as are the lamps
     key, fill = (np.array(lamp) / np.linalg.norm(lamp) for lamp in ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60)))
     normal = triangles.normals @ camera.frame.T

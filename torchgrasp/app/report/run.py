@@ -1,4 +1,4 @@
-"""A run from cloud to grasps and closing, the moments of the closing, and its verdict in words."""
+"""The data of one run, from cloud to grasps and closing, and its results in words."""
 
 import dataclasses
 import math
@@ -32,20 +32,20 @@ LOST = "lost"  # name of the moment at which an object was lost
 @checked
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Everything that a report shows.
+    """The data of one run that a report shows.
 
     Args:
         object_name: name of the object in titles and sentences.
         source: file of the cloud or the scene.
         cloud: points of the object.
         hand: the hand that grasps.
-        spec: what was asked of the contacts.
+        spec: constraints on the contacts.
         surface: the estimated surface.
         grasps: the planned grasps, best first.
         stages: name, result and wall time [s] of each stage.
         plan: planned contacts.
         mesh: the true object [m], in the frame of the cloud.
-        closure: the closing on the true object; with a mesh only.
+        closure: result of closing on the true object; only with `mesh`.
         scene: the scene that the cloud was cut from.
         explanation: why no grasp is executable.
 
@@ -109,7 +109,7 @@ def verdict(run: Run) -> str:
 
 
 def closing_sentence(run: Run) -> str:
-    """Say whether the object was held, the rise of its centre of mass, and its motion in the hand."""
+    """Return a sentence: whether the object was held, how far it rose, and how it moved in the hand."""
     upright = run.upright()
     closure, mesh = upright.closure, upright.mesh
     assert closure is not None and mesh is not None
@@ -125,7 +125,7 @@ def closing_sentence(run: Run) -> str:
 
 
 def refusal(run: Run) -> str:
-    """Say why no grasp is executable: each reason with its number of postures or initial guesses."""
+    """Return a sentence that says why no grasp is executable: each reason with its count."""
     head = f"The {run.hand.name} hand has no executable grasp of the {run.object_name}"
     if len(run.grasps):
         failed, total = run.grasps.status, f"{len(run.grasps)} postures"
@@ -138,7 +138,7 @@ def refusal(run: Run) -> str:
 
 
 def _too_low(run: Run) -> str:
-    """Return the height that the hand's fingertips need on the table, if the object is lower."""
+    """Return a remark if the object is lower than the hand's fingertips need; "" otherwise."""
     spec = run.spec.for_fingertips(float(run.hand.tips.radius.max()))
     if spec.plane is None or not len(run.surface.vertices):
         return ""
@@ -147,14 +147,14 @@ def _too_low(run: Run) -> str:
 
 
 class Moment(NamedTuple):
-    """A tick and the name of what happened then."""
+    """A key moment of a closing: its tick and its name."""
 
     tick: int
     name: str
 
 
 def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
-    """Return which fingertips touch the object."""
+    """Return which fingertips touch the object at each tick."""
     return closure.trace.normals.isfinite().all(-1)
 
 
@@ -167,7 +167,7 @@ def first_touches(closure: ClosureResult) -> list[int]:
 def moved_in_hand(
     closure: ClosureResult, centre: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
-    """Return how far the centre of mass moved [m] and turned [rad] in the hand since all fingers pressed."""
+    """Return how far the object has moved [m] and turned [rad] in the hand since the pressing, at each tick."""
     hand_from_object = inverse(closure.hand_pose.double()) @ closure.object_pose.double()
     start = hand_from_object[tick_of(closure, 2)]
     centres = apply(hand_from_object, centre.double().expand(len(hand_from_object), 1, 3))[:, 0]
@@ -184,8 +184,9 @@ def tick_of(closure: ClosureResult, phase: int) -> int:
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     """Return the tick at which the object was lost; None if it was held.
 
-    EJECTED: the first tick at which the object is too far from its place. TOO_HEAVY: the highest tick. Otherwise the
-    earlier of two ticks: from then on fewer than two fingertips touch, or the object has slipped too far in the hand.
+    For EJECTED it is the first tick at which the object is too far from its place; for TOO_HEAVY the tick of greatest
+    height. Otherwise it is the tick at which fewer than two fingertips touch for the rest of the trial, or the object
+    has slipped too far in the hand, whichever is earlier.
     """
     if closure.held:
         return None
@@ -207,7 +208,7 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
 
 
 def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> str:
-    """Say when the object was lost, in which phase, and which finger failed first; "" if it was held."""
+    """Return a sentence: when and in which phase the object was lost, and which finger failed first; "" if held."""
     tick = find_loss(closure, centre)
     if tick is None:
         return ""
@@ -221,13 +222,13 @@ def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tu
 
 
 def _never_touched(closure: ClosureResult, fingers: tuple[str, ...]) -> str:
-    """Name the fingers that never touched."""
+    """Return a text that names the fingers that never touched the object."""
     never = [name for finger, name in enumerate(fingers) if finger not in closure.contact_order]
     return f"{' and '.join(never)} never touched the object" if never else ""
 
 
 def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) -> str:
-    """Name the finger that was the first to slide or let go for good before a tick."""
+    """Return a text that names the finger that slid or let go first, without firm contact until the tick."""
     touched, sliding = touching(closure)[: tick + 1], closure.trace.sliding[: tick + 1].nan_to_num(0.0)
     firm = touched & (sliding < 0.01)  # [m/s]: fingertips that stick creep more slowly
     # The first tick after which each finger was never firm again; the finger with the earliest gave way first.
@@ -246,7 +247,7 @@ def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) ->
 
 
 def moments_of(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> list[Moment]:
-    """Return the moments that a film of a closing shows, in order."""
+    """Return the key moments that the film strip of a closing shows, in order."""
     found = [Moment(tick_of(closure, 0), "open hand")]
     if closure.contact_order:
         found.append(Moment(first_touches(closure)[0], f"{fingers[closure.contact_order[0]]} touches first"))

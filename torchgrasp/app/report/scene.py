@@ -1,4 +1,4 @@
-"""The picture of a scene: what the library took for the support, for objects and for obstacles."""
+"""The picture of a scene: which pixels the library considers support, objects and obstacles."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def draw_scene(scene: Scene, path: Path | str) -> Path:
 
 
 def encode_scene(scene: Scene) -> bytes:
-    """Return the picture of `draw_scene`."""
+    """Return the picture of a scene as PNG, as `draw_scene` writes it."""
     from PIL import Image
     from scipy.ndimage import maximum_filter
 
@@ -66,7 +66,7 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-    """Return for each pixel the index of its kind in `KINDS`, and its label; the kind counts where the label is 0."""
+    """Return the index in `KINDS` and the object label of each pixel; the index matters where the label is 0."""
     image, labels = scene.image, np.zeros(scene.image.depth.shape, dtype=int)
     labels[tuple(scene.pixels.cpu().numpy().T)] = scene.labels.cpu().numpy()
     points, measured = image.points(), image.depth.numpy() > 0
@@ -80,7 +80,7 @@ def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "
 
 
 def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
-    """Return how much of each pixel is on a line of a grid of 10 cm in the plane."""
+    """Return how much each pixel lies on the lines of a 10 cm grid in the table plane."""
     flat = DepthImage(torch.ones_like(image.depth), image.intrinsics, image.obj_from_camera).points()
     camera, normal = image.obj_from_camera[:3, 3].double(), table.normal.double()
     rays = flat - camera
@@ -98,7 +98,7 @@ def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
 
 
 def _light(scene: Scene) -> Float[np.ndarray, "h w"]:
-    """Return the brightness of each pixel: faces towards the sky and the camera are bright, distant faces darker."""
+    """Return the brightness of each pixel: higher for faces towards the sky and the camera, lower far away."""
     from scipy.ndimage import gaussian_filter
 
     depth, seen = scene.image.depth.double().numpy(), scene.image.depth.numpy() > 0
@@ -117,7 +117,7 @@ def _light(scene: Scene) -> Float[np.ndarray, "h w"]:
 
 
 def _rim(labels: np.ndarray, width: int) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels beside another label."""
+    """Return the pixels next to a pixel with another label."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     whole = labels.astype(int)
@@ -125,7 +125,7 @@ def _rim(labels: np.ndarray, width: int) -> Bool[np.ndarray, "h w"]:
 
 
 def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> None:
-    """Write the number of each object at its widest place."""
+    """Write the label of each object at its widest place in the picture."""
     from PIL import Image, ImageDraw, ImageFont
     from scipy.ndimage import distance_transform_edt
 
@@ -143,7 +143,7 @@ def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> No
 
 
 def _with_legend(picture: object, scene: Scene, kinds: Int[np.ndarray, "h w"]) -> object:
-    """Return the picture above its legend: the kinds of pixels, then the height and the distance of each object."""
+    """Return the picture with a legend below it: kinds of pixels, then height and distance of each object."""
     from PIL import Image, ImageDraw, ImageFont
 
     assert isinstance(picture, Image.Image)
@@ -165,7 +165,7 @@ def _with_legend(picture: object, scene: Scene, kinds: Int[np.ndarray, "h w"]) -
 
 
 def _describe(scene: Scene, label: int) -> str:
-    """Return the number of an object, its height, and its distance from the camera."""
+    """Return the legend text of an object: its label, its height, and its distance from the camera."""
     points = scene.points[scene.rows_of(label)].double()
     distance = float((points - scene.viewpoint).norm(dim=-1).median())
     high = "" if scene.table is None else f"{1e3 * float(scene.table.height(points).quantile(0.98)):.0f} mm high, "

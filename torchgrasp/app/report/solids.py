@@ -1,4 +1,4 @@
-"""A hand as meshes to draw: the collision shapes of its URDF with rounded edges, each in the colour of its finger."""
+"""A hand as meshes to draw: collision shapes with rounded edges, in the colours of the fingers."""
 
 import functools
 import itertools
@@ -17,7 +17,7 @@ EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot fing
 
 
 class Solid(NamedTuple):
-    """A mesh with vertex normals, the index of its link in the hand's tree, and its finger or `PARKED`."""
+    """A mesh of one collision shape with vertex normals, the index of its link, and its finger or `PARKED`."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
@@ -27,12 +27,12 @@ class Solid(NamedTuple):
 
     @property
     def color(self) -> str:
-        """The colour of the finger or of the palm."""
+        """The colour of the finger, or of the palm."""
         return HAND if self.finger == PARKED else FINGERS[self.finger]
 
 
 def solids_of_links(hand: Hand) -> list[Solid]:
-    """Return the shapes of a hand, each in the frame of its link."""
+    """Return the collision shapes of a hand as meshes, each in the frame of its link."""
     shapes = {link.name: link.shapes for link in read_urdf(hand.urdf_path).links}
     fingers = finger_of_links(hand)
     return [
@@ -45,7 +45,7 @@ def solids_of_links(hand: Hand) -> list[Solid]:
 def link_poses(
     hand: Hand, joints: Float[Tensor, "n j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "n 4 4"]
 ) -> Float[Tensor, "n l 4 4"]:
-    """Return the poses of all links, at all movable joints [rad] of the URDF in the order of `names`."""
+    """Return the poses of all links in the object's frame; `names` gives the order of the joints [rad]."""
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()
     return obj_from_hand.double()[:, None] @ hand.tree.poses(values)
 
@@ -53,7 +53,7 @@ def link_poses(
 def solids_from_hand(
     hand: Hand, joints: Float[Tensor, " j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "4 4"]
 ) -> list[Solid]:
-    """Return the shapes of a hand in the object's frame; the joints are as in `link_poses`."""
+    """Return the collision shapes of a hand as meshes in the object's frame; arguments as in `link_poses`."""
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
     return [
         solid._replace(
@@ -65,7 +65,7 @@ def solids_from_hand(
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
-    """Return the finger of each link: the only finger whose tip all joints of the link move, else `PARKED`."""
+    """Return the index of the finger that each link belongs to; `PARKED` if it belongs to none or several."""
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
     for mine, name in zip(moves, hand.tree.link_names, strict=True):
@@ -76,9 +76,9 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
 
 @functools.lru_cache(maxsize=512)  # a hand is drawn many times
 def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and normals of a box, cylinder or sphere with rounded edges, in the frame of its link.
+    """Return vertices, faces and normals of a collision shape with rounded edges, in the frame of its link.
 
-    The solid is the convex hull of balls, so its normals are the directions from the centres of the balls.
+    The solid is the convex hull of balls, so the normals point away from the balls' centres.
     """
     from scipy.spatial import ConvexHull
     from trimesh import creation
@@ -100,7 +100,7 @@ def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _box(size: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the centres, directions and radius of the balls at the corners of a box."""
+    """Return centres, directions and radius of the balls at the corners of a box."""
     radius = min(EDGE, min(size) / 4)  # thin plates stay plates
     grid = [ij for ij in itertools.product(range(4), repeat=3) if sum(ij) == 3]  # an octant in steps of 30 degrees
     octant = np.array(grid) / np.linalg.norm(grid, axis=1, keepdims=True)
@@ -109,7 +109,7 @@ def _box(size: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _cylinder(radius: float, length: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the centres, directions and radius of the balls along the rims of a cylinder."""
+    """Return centres, directions and radius of the balls along the rims of a cylinder."""
     edge = min(EDGE, min(2.0 * radius, length) / 4)
     turn, tilt, side = np.meshgrid(
         np.linspace(0.0, 2 * np.pi, 40, endpoint=False), np.linspace(0.0, np.pi / 2, 4), (-1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Stills as PNGs: of a cloud, an estimated surface, contacts, a grasp, a scene and a hand."""
+"""Pictures as PNGs: of a cloud, an estimated surface, contacts, a grasp, a scene and a hand."""
 
 import io
 
@@ -53,7 +53,7 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
 
 
 def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:
-    """Draw the first row's contacts with normals on the estimated surface."""
+    """Draw the contacts of the first grasp, with normals, on the estimated surface."""
     vertices = to_array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals), transparent=True)
@@ -63,14 +63,14 @@ def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, ta
 
 
 def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None) -> bytes:
-    """Draw the first row's hand on the estimated surface."""
+    """Draw the hand of the first grasp on the estimated surface."""
     canvas, corners = _grasp(surface, hand, grasp)
     canvas.add_table(corners, table)
     return canvas.render_png(corners, direction)
 
 
 def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direction: Direction) -> bytes:
-    """Draw the first row's hand on the target, among the measured points of its neighbours; all in an upright frame."""
+    """Draw the hand of the first grasp on the target, among the measured points of its neighbours."""
     canvas, corners = _grasp(surface, hand, grasp)
     others = (scene.labels > 0) & ~scene.rows_of()
     points, labels = to_array(scene.points[others]), scene.labels[others].cpu().numpy()
@@ -82,9 +82,9 @@ def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direct
 
 
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
-    """Draw a hand at a posture from two sides, at both ends of its joint limits, and the limits themselves.
+    """Draw a hand at a posture from two sides, at the lower and upper joint limits, and the ranges of the joints.
 
-    An arrow on each fingertip is its normal. The palm's x, y and z are red, green and blue.
+    Arrows on the fingertips are their normals. The palm's axes x, y and z are red, green and blue.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -120,7 +120,7 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
-    """Draw a hand with its fingertip normals and its palm frame, in the palm frame."""
+    """Draw a hand at a posture, with its fingertip normals and the axes of its palm."""
     solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints))
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     arrow, axis = 0.03, 0.6 * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
@@ -133,7 +133,7 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
 
 
 def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
-    """Return the posture whose pads best face their middle, without self-collision where possible."""
+    """Return the posture in which the fingertip pads face each other best, without self-collision if possible."""
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
     facing = (normals * unit(inward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(inward, dim=-1).amax(1)
@@ -141,7 +141,7 @@ def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "
 
 
 def view_of(cloud: PointCloud) -> Direction:
-    """Return the direction from a cloud to its camera, or a fixed one where the camera is not known."""
+    """Return the direction from a cloud to its camera; a fixed direction if the camera is unknown."""
     first = cloud.split_views()[0].viewpoint
     if first is None:
         return (1.0, -0.8, 0.6)
@@ -150,7 +150,7 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return a view direction from which all fingers of the first grasp are visible: at right angles to the normals."""
+    """Return a direction from which all fingers of the first grasp are visible, perpendicular to the normals."""
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
     across = torch.stack([-press[1], press[0]])
@@ -167,12 +167,12 @@ def rotated(direction: Direction, degrees: float) -> Direction:
 
 
 def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
-    """Return a tensor as an array of doubles."""
+    """Return a tensor as a NumPy array in float64."""
     return value.detach().cpu().double().numpy()
 
 
 def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[Canvas, Float[np.ndarray, "n 3"]]:
-    """Return a canvas with the surface, the first row's hand and its contacts, and the corners to frame."""
+    """Return a canvas with the surface and the first grasp's hand and contacts, and all points to frame."""
     joints, vertices = hand.expand_joints(grasp.joints[0].double()), to_array(surface.vertices)
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     canvas = Canvas()
@@ -183,19 +183,19 @@ def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[Canvas, Float[n
 
 
 def _add_contacts(canvas: Canvas, contacts: Contacts) -> None:
-    """Add an arrow of 45 mm along the normal of each contact of the first row, in the colour of its finger."""
+    """Add an arrow along the normal of each contact of the first grasp, in the colour of its finger."""
     points, normals = to_array(contacts.points[0]), to_array(contacts.normals[0])
     canvas.add_arrows(points, normals, 0.045, FINGERS[: len(points)])
 
 
 def _add_solids(canvas: Canvas, solids: list[Solid]) -> None:
-    """Add the links of a hand."""
+    """Add the links of a hand to a canvas."""
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
 
 
 def _joint_colors(hand: Hand) -> list[str]:
-    """Return for each actuated joint the colour of its finger, or that of the palm where it moves several fingers."""
+    """Return the colour for each actuated joint: that of its finger, or of the palm if it moves several fingers."""
     finger_of_link = finger_of_links(hand)
     finger_of_joint = [finger_of_link[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
     moved = [{finger_of_joint[j] for j in torch.nonzero(row)[:, 0].tolist()} for row in hand.actuated.coupling.T]
@@ -203,11 +203,11 @@ def _joint_colors(hand: Hand) -> list[str]:
 
 
 def _label_colors(labels: np.ndarray) -> Float[np.ndarray, "*b 3"]:
-    """Return the colour of each label; 0 is the table."""
+    """Return the colour for each label; 0 is the table."""
     palette = np.stack([rgb(name) for name in (TABLE, *OBJECTS)])
     return palette[np.where(labels > 0, 1 + (labels - 1) % len(OBJECTS), 0)]
 
 
 def _thinned(rows: np.ndarray, most: int) -> np.ndarray:
-    """Return every k-th row, at most so many: more points would hide each other."""
+    """Return every k-th row, at most `most` rows."""
     return rows[:: -(-len(rows) // most)]

@@ -1,4 +1,4 @@
-"""A 3D page of one run as one HTML file that loads nothing: shape, contacts, postures, and the closing replayed."""
+"""An interactive 3D page of one run in one HTML file: shape, contacts, postures, and the replayed closing."""
 
 import base64
 import functools
@@ -63,7 +63,7 @@ def write_viewer(path: Path | str, run: Run) -> Path:
 
 
 def format_viewer(run: Run) -> str:
-    """Return the 3D page of a run as text."""
+    """Return the 3D page of a run as HTML."""
     contents, folder = describe(run), Path(__file__).with_name("templates")
     # The two files are one function, so that no name of theirs meets a name of the library.
     parts = "".join((folder / name).read_text(encoding="utf-8") for name in ("scene.js", "panel.js"))
@@ -76,7 +76,7 @@ def format_viewer(run: Run) -> str:
 
 @functools.cache
 def three() -> str:
-    """Return three.js with its trackball from the viewer in trimesh, without the call that starts trimesh's viewer."""
+    """Return the JavaScript of three.js with trackball controls, taken from trimesh's viewer."""
     archive = resources.files("trimesh") / "resources" / "templates" / "viewer.zip"
     with archive.open("rb") as file, zipfile.ZipFile(file) as opened:
         template = opened.read("viewer.html.template").decode("utf-8")
@@ -89,7 +89,7 @@ def three() -> str:
 
 
 def describe(run: Run) -> dict[str, Any]:
-    """Return the contents of the page in an upright frame, as JSON with buffers."""
+    """Return the contents of the 3D page as a dictionary for JSON, in an upright frame."""
     sentence, run = verdict(run), run.upright()
     best, scene = run.executable[:MOST_GRASPS], run.scene
     return {
@@ -121,19 +121,19 @@ def describe(run: Run) -> dict[str, Any]:
 
 
 def _eye(direction: Direction) -> list[float]:
-    """Return the unit direction to the first camera, which looks from above."""
+    """Return the unit direction towards the initial camera, which looks from above."""
     x, y, z = direction
     eye = np.array([x, y, max(z, 0.35 * float(np.hypot(x, y)))])
     return (eye / np.linalg.norm(eye)).tolist()
 
 
 def _points(points: Float[Tensor, "n 3"]) -> dict[str, object]:
-    """Return at most 10,000 points of a cloud."""
+    """Return at most 10,000 points of a cloud, as a packed buffer."""
     return pack(to_array(points)[thin_rows(len(points), 10_000)])
 
 
 def _surface(run: Run) -> dict[str, object]:
-    """Return the estimated surface, its standard deviation and its colours."""
+    """Return the estimated surface with standard deviations and colours, as packed buffers."""
     surface, std_m = run.surface, to_array(run.surface.std_m)
     kept, faces = thin_mesh(to_array(surface.vertices), surface.faces.cpu().numpy(), MOST_FACES)
     most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6
@@ -149,7 +149,7 @@ def _surface(run: Run) -> dict[str, object]:
 
 
 def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
-    """Return the rows of the list, contacts, and the poses of all links in each of the `POSTURES`."""
+    """Return the table rows of grasps, their contacts, and all link poses in each of the `POSTURES`."""
     columns = (0, 1, 5, 3, 6)  # rank, success, margin, clearance and standard deviation
     pose, opened = grasps.obj_from_hand.double(), grasps.pregrasp.double()
     away = pose.clone()
@@ -167,7 +167,7 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
 
 
 def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
-    """Return the true object, its poses and those of all links at some ticks, and the forces at all ticks."""
+    """Return the data of the replayed closing: object mesh, poses of object and links at some ticks, forces at all."""
     assert run.mesh is not None
     ticks = thin_rows(len(closure.time), MOST_TICKS)
     kept, faces = thin_mesh(np.asarray(run.mesh.vertices), np.asarray(run.mesh.faces), MOST_FACES)
@@ -184,7 +184,7 @@ def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
 
 
 def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
-    """Return an array as a buffer: its kind (f4, u4 or u1, little-endian), its shape, and its bytes in base64."""
+    """Return an array for JSON: its number format (f4, u4 or u1, little-endian), shape, and bytes in base64."""
     data = np.ascontiguousarray(values).astype(f"<{kind}").tobytes()
     return {"kind": kind, "shape": list(values.shape), "data": base64.b64encode(data).decode("ascii")}
 
@@ -192,9 +192,9 @@ def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
 def thin_mesh(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], most: int
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "g 3"]]:
-    """Return which vertices to keep, and at most so many faces between them.
+    """Return which vertices to keep and at most `most` faces between them.
 
-    The vertices in a cell of a grid become its first vertex; the cells grow until the faces are few enough.
+    All vertices in a cell of a grid are replaced by one of them; the cells grow until the faces are few enough.
     """
     kept, thinned = np.arange(len(vertices)), faces
     cell = float(np.linalg.norm(np.ptp(vertices, axis=0))) / 256 if len(vertices) else 0.0
@@ -208,5 +208,5 @@ def thin_mesh(
 
 
 def thin_rows(count: int, most: int) -> Int[np.ndarray, " k"]:
-    """Return at most so many rows, evenly from the first to the last."""
+    """Return the indices of at most `most` rows, evenly spread from the first to the last."""
     return np.arange(count) if count <= most else np.round(np.linspace(0, count - 1, most)).astype(np.int64)
