@@ -2,9 +2,11 @@
 
 import functools
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +28,15 @@ from torchgrasp.shape.values import Normalisation, Observations
 from torchgrasp.values import Contacts, PointCloud
 
 ROOT = Path(__file__).parents[1]
+
+
+def start_process(command: list[str], **options: Any) -> subprocess.Popen[str]:
+    """Start a process that SIGINT reaches: children inherit that a shell's background processes ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def real(values) -> Tensor:

@@ -43,17 +43,8 @@ def test_count_status_puts_the_most_frequent_first():
     assert list(count_status(torch.tensor([0, 13, 13]))) == [Status.NOT_CLOSED, Status.OK]
 
 
-ONE_ROW = [
-    1,
-    -2,
-    np.int64(1),
-    np.array(1),
-    torch.tensor(1),
-    slice(1, 2),
-    torch.tensor([False, True, False]),
-    torch.tensor([1]),
-    [1],
-]
+ONE_ROW = [1, -2, np.int64(1), np.array(1), torch.tensor(1), slice(1, 2), torch.tensor([1]), [1]]
+ONE_ROW += [torch.tensor([False, True, False])]
 
 
 @pytest.mark.parametrize("rows", ONE_ROW, ids=repr)
@@ -112,10 +103,8 @@ def test_to_returns_a_new_value_and_keeps_integers():
     after = before.to(torch.float64)
     assert after.contacts.points.dtype == torch.float64 and before.contacts.points.dtype == torch.float32
     assert after.status.dtype == torch.int64
-    certificate = Certificate(*(torch.rand(2) for _ in range(3)), torch.tensor([True, False]), torch.rand(2, 6)).to(
-        torch.float64
-    )
-    assert certificate.closed.dtype == torch.bool
+    certificate = Certificate(*torch.rand(3, 2), torch.tensor([True, False]), torch.rand(2, 6))
+    assert certificate.to(torch.float64).closed.dtype == torch.bool
 
 
 @pytest.mark.parametrize("value", [8.5, "8", True, None, math.nan, 2], ids=repr)

@@ -175,13 +175,7 @@ def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: in
     """Evaluate a function of the leading axis in chunks of `size` rows, which bounds the memory."""
     if len(x) <= size:
         return evaluate(x)
-    whole: tuple[Any, ...] = ()
-    for start in range(0, len(x), size):
-        pieces = evaluate(x[start : start + size])
-        whole = whole or tuple(p.new_empty((len(x), *p.shape[1:])) for p in pieces)
-        for target, piece in zip(whole, pieces, strict=True):
-            target[start : start + size] = piece
-    return whole
+    return tuple(map(torch.cat, zip(*map(evaluate, x.split(size)), strict=True)))
 
 
 def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:

@@ -85,6 +85,7 @@ def special(kind: type) -> Any:
         StepContacts: StepContacts.none,
         torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
         torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
+        Shape: lambda: special(torchgrasp.ShapeGP),
         Kernel: lambda: thin_plate_kernel(2.0),
         GaussianMixture: lambda: GaussianMixture(*mixture),
         GraspMixture: lambda: GraspMixture(*mixture),
@@ -142,23 +143,8 @@ def sample(hint: Any, path: Path, own: Lengths = NONE) -> Any:
         return inside[0]
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
         return sample_tensor(hint, own)
-    if hint is Shape:
-        return special(torchgrasp.ShapeGP)
-    if hint is torch.Tensor:
-        return torch.ones(3, dtype=torch.float64)
-    if hint is np.ndarray:
-        return np.ones((6, 3))
-    simple = {
-        int: 1,
-        float: 0.5,
-        bool: True,
-        str: "x",
-        bytes: b"x",
-        Path: path / "x",
-        object: 0,
-        Any: 0,
-        type(None): None,
-    }
+    simple = {int: 1, float: 0.5, bool: True, str: "x", bytes: b"x", Path: path / "x", object: 0, Any: 0}
+    simple |= {type(None): None, Tensor: torch.ones(3, dtype=torch.float64), np.ndarray: np.ones((6, 3))}
     if hint in simple:
         return simple[hint]
     if origin is collections.abc.Callable:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.make import start_process
+
 WAITING = """
 import sys, time
 from pathlib import Path
@@ -30,12 +32,7 @@ cli.run_and_exit()
 @pytest.mark.parametrize(("sign", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
 def test_a_command_that_is_told_to_end_says_so_and_leaves_nothing(tmp_path: Path, sign: str, code: int, said: str):
     command = [sys.executable, "-c", WAITING, "wait", "--out", str(tmp_path / "out")]
-    # a shell's background processes ignore SIGINT, and their children inherit that
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    run = start_process(command, stdout=subprocess.PIPE)
     assert run.stdout is not None and run.stdout.readline() == "ready\n"
     run.send_signal(getattr(signal, sign))
     _, told = run.communicate()
@@ -74,12 +71,7 @@ cli.run_and_exit()
 )
 def test_signals_do_not_disturb_an_end(command: str, code: int, words: list[str], said: str):
     """An impatient user sends both signals while the command tidies up, and while Python itself ends."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        script = [sys.executable, "-c", ENDING, command]
-        run = subprocess.Popen(script, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    run = start_process([sys.executable, "-c", ENDING, command], stdout=subprocess.PIPE)
     assert run.stdout is not None
     for word in words:
         assert run.stdout.readline() == f"{word}\n"
@@ -118,11 +110,7 @@ def test_workers_that_are_told_to_end_with_their_command_say_nothing(tmp_path: P
     pytest.importorskip("pebble")
     (tmp_path / "script.py").write_text(WORKING)
     command = [sys.executable, str(tmp_path / "script.py"), "work", "--out", str(tmp_path)]
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    run = start_process(command, start_new_session=True)
     marks = [tmp_path / "a", tmp_path / "b"]
     while run.poll() is None and not all(mark.exists() for mark in marks):
         time.sleep(0.05)

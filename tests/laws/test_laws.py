@@ -1,6 +1,5 @@
 """Laws that hold over whole stages: rigid motions, units, the order of points, seeds, global state."""
 
-import hashlib
 import subprocess
 import sys
 
@@ -8,15 +7,7 @@ import pytest
 import torch
 
 from tests.make import ball_contacts
-from torchgrasp import (
-    ContactSpec,
-    PointCloud,
-    certify,
-    encode,
-    fit_shape,
-    load_object,
-    plan_contacts,
-)
+from torchgrasp import ContactSpec, PointCloud, certify, encode, fit_shape, load_grasps, load_object, plan_contacts
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.values import Normalisation, Observations
@@ -102,22 +93,24 @@ def test_the_same_seed_gives_the_same_plan(seen_cylinder):
 
 
 GRASP = """
-import torch
-torch.set_num_threads(1)
+import sys, torch
+torch.set_num_threads(int(sys.argv[1]))
 from torchgrasp import load_hand, load_object, plan_grasps
-plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=60, seed=3).save({path!r})
+plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=20, seed=3).save(sys.argv[2])
 """
 
 
 @pytest.mark.promise("N10")
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_grasps_in_two_processes(tmp_path):
-    digests = []
-    for name in ("a", "b"):
-        path = str(tmp_path / name)
-        subprocess.run([sys.executable, "-c", GRASP.format(path=path)], check=True, timeout=300)
-        digests.append(hashlib.sha256((tmp_path / name).read_bytes()).hexdigest())
-    assert digests[0] == digests[1]
+def test_the_same_seed_gives_the_same_grasps_in_other_processes_and_with_two_threads_but_for_rounding(tmp_path):
+    paths = [tmp_path / "one", tmp_path / "again", tmp_path / "two"]
+    for path, threads in zip(paths, "112", strict=True):
+        subprocess.run([sys.executable, "-c", GRASP, threads, str(path)], check=True, timeout=300)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    one, two = load_grasps(paths[0]), load_grasps(paths[2])
+    assert len(one) > 0 and torch.equal(one.status, two.status)
+    torch.testing.assert_close(one.joints, two.joints, rtol=0, atol=1e-6)
+    torch.testing.assert_close(one.obj_from_hand, two.obj_from_hand, rtol=0, atol=1e-6)
 
 
 STATE = """
@@ -127,7 +120,7 @@ import torch
 before = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate(), torch.get_default_dtype()
 threads = torch.get_num_threads()
 from torchgrasp import load_hand, load_object, plan_grasps
-grasps = plan_grasps(load_object("cylinder").view, load_hand("allegro"), starts=40)
+grasps = plan_grasps(load_object("cylinder").view, load_hand("allegro"), starts=15)
 assert len(grasps) > 0
 assert torch.equal(torch.get_rng_state(), before[0])
 assert np.array_equal(np.random.get_state()[1], before[1])

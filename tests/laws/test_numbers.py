@@ -1,8 +1,6 @@
 """Numbers far from the usual: places, sizes, friction, edges, threads. Equal where it is promised, else a status."""
 
 import itertools
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -15,9 +13,6 @@ from torchgrasp import ContactSpec, Plane, PointCloud, certify, fit_shape, load_
 from torchgrasp.cloud import look_at, partial_view
 from torchgrasp.errors import CloudWarning, Status
 from torchgrasp.values import Contacts
-
-CONES = {}
-"""Verdicts by friction and edges."""
 
 
 @pytest.mark.promise("I6")
@@ -109,27 +104,3 @@ def test_friction_and_edges_decide_as_an_independent_programme_does_and_more_nev
         if edges in (4, 8):
             assert bool((found <= closed[friction, 24]).all())
     assert 0 < int(closed[0.3, 8].sum()) < int(closed[2.0, 24].sum())
-
-
-THREADS = """
-import sys, torch
-torch.set_num_threads(int(sys.argv[1]))
-from torchgrasp import load_hand, load_object, plan_grasps
-plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=30, seed=3).save(sys.argv[2])
-"""
-
-
-@pytest.mark.promise("N10")
-@pytest.mark.slow
-def test_one_and_two_threads_give_the_same_grasps_but_for_rounding(tmp_path):
-    from torchgrasp import load_grasps
-
-    found = []
-    for threads in ("1", "2"):
-        path = tmp_path / f"{threads}.safetensors"
-        subprocess.run([sys.executable, "-c", THREADS, threads, str(path)], check=True, timeout=300)
-        found.append(load_grasps(path))
-    one, two = found
-    assert torch.equal(one.status, two.status)
-    torch.testing.assert_close(one.joints, two.joints, rtol=0, atol=1e-6)
-    torch.testing.assert_close(one.obj_from_hand, two.obj_from_hand, rtol=0, atol=1e-6)

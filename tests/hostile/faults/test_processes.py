@@ -17,6 +17,7 @@ import pytest
 
 from tests.hostile.faults.commands import POSE
 from tests.hostile.faults.inject import contents
+from tests.make import start_process
 from torchgrasp.data.shipped import DATA
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -85,25 +86,17 @@ def words(name: str, folder: Path) -> list[str]:
         return ["campaign", place, "--hand", "barrett", "--protocol", "dexgraspbench", *sizes, "--out"]
     return {
         "grasp": ["grasp", str(DATA / "cylinder" / "view.ply"), "--hand", "barrett", "--starts", "8", "--out"],
-        "sample": ["hand", "sample", "--hand", "barrett", "--n", "3000", "--workers", "2", "--out"],
+        "sample": ["hand", "sample", "--hand", "barrett", "--n", "1500", "--workers", "2", "--out"],
         "train": ["hand", "train", "barrett", "--n", "2000", "--held-out", "100", "--components", "3", "--out"],
     }[name]
 
 
 def start(script: str, folder: Path, given: list[str], **environment: str) -> subprocess.Popen[str]:
-    """Start a script of the above; SIGINT reaches it, whatever the tests' own process does with it."""
+    """Start a script of the above."""
     (folder / "script.py").write_text(script)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        return subprocess.Popen(
-            [sys.executable, str(folder / "script.py"), *given],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(folder / "cache")} | environment,
-        )
-    finally:
-        signal.signal(signal.SIGINT, before)
+    own = {"OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(folder / "cache")}
+    command = [sys.executable, str(folder / "script.py"), *given]
+    return start_process(command, stdout=subprocess.PIPE, env=os.environ | own | environment)
 
 
 def descendants(pid: int) -> list[int]:

@@ -10,13 +10,7 @@ import numpy as np
 import torch
 import trimesh
 
-from torchgrasp import (
-    PointCloud,
-    cloud_from_depth,
-    load_hand,
-    read_cloud,
-    read_scene,
-)
+from torchgrasp import PointCloud, cloud_from_depth, load_hand, read_cloud, read_scene
 from torchgrasp.app.author.draft import new_hand
 from torchgrasp.cloud.depth import read_image, read_pose
 from torchgrasp.cloud.read import save_cloud
