@@ -7,7 +7,7 @@ grasp  lifts, pulls: from one noisy view to a held object, for every object of a
 hand   fk, collision, samples, codes, em, mae, queries: kinematics, learned model and inverse kinematics
 load   plans, trials, points, starts: memory over many plans and trials, and of large inputs
 plan   truth, fields, executable, certificates: the contact planner on the true surface and in exact arithmetic
-scene  plane, click, frames, clutter, clear: depth images, random frames, lifts among neighbours
+scene  plane, click, rooms, frames, clutter, clear: depth images, random frames, lifts among neighbours
 shape  objects, weaker: the estimated shape against true meshes
 
 Each bench prints rows, and writes them as JSON and as a Markdown table with commit, machine and command. Times are for

@@ -78,4 +78,4 @@ def test_a_camera_is_chosen_by_name_or_by_its_noise():
 def test_an_unknown_camera_is_refused_by_name():
     ball = trimesh.creation.icosphere(radius=0.04)
     with pytest.raises(BadArgument, match="noise"):
-        partial_view(ball, look_at(0.0, 30.0), noise="sony")
+        partial_view(ball, look_at(0.0, 30.0), noise="sony")  # pyright: ignore[reportArgumentType]

@@ -1,16 +1,20 @@
-"""The noise of depth cameras: added to exact images, and estimated from real ones."""
+"""The noise of depth cameras: added to exact images, estimated from real ones, and reduced by several frames."""
 
 import dataclasses
 import types
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Literal
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import checked
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.plane import Plane
 
 SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 """Depth cameras with a model of their noise."""
@@ -29,7 +33,7 @@ class SensorNoise(Value):
     disparity: float = 0.0  # standard deviation of the disparity [px]
     step: float = 0.0  # between two values of the disparity [px]; 0: none
     floor: float = 0.0  # standard deviation [m] at any distance
-    growth: float = 0.0  # of time of flight: standard deviation over the squared distance [1/m]
+    growth: float = 0.0  # without a base: standard deviation over the squared distance [1/m]
     grain: float = 0.0  # width of the patches in which pixels have similar noise [px]; 0: each has its own
     bias: float = 0.0008  # standard deviation of the smooth bias [m]
     bias_width: float = 12.0  # width of the patches of the bias [px]
@@ -50,11 +54,11 @@ class SensorNoise(Value):
 ACTIVE_STEREO = SensorNoise(base=616.0 * 0.055, disparity=0.12, step=1 / 32)
 """An active stereo camera whose eyes are 55 mm apart, with independent noise of its pixels: `noise=True`."""
 
-SENSORS = types.MappingProxyType({
+SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType({
     # Intel's tuning guide of the D400: about 0.08 px of subpixel noise, 50 mm baseline; patches as in public frames.
-    "realsense": SensorNoise(30.8, 0.08, 1 / 32, grain=5.0, bias=0.0015, bias_width=30.0, shadow=True),
+    "realsense": SensorNoise(30.8, 0.08, 1 / 32, grain=5.0, bias=0.0015, bias_width=18.0, shadow=True),
     # Khoshelham and Oude Elberink 2012: 0.00143 z^2 in all, steps of 1/8 px; 580 px and 75 mm.
-    "kinect_v1": SensorNoise(43.5, 0.05, 1 / 8, grain=2.0, bias=0.0014, bias_width=30.0, shadow=True),
+    "kinect_v1": SensorNoise(43.5, 0.05, 1 / 8, grain=2.0, bias=0.0014, bias_width=18.0, shadow=True),
     # Toelgyessy et al. 2021: below 17 mm and 11 mm of bias up to 3.5 m; flying pixels and multipath of time of flight.
     "azure": SensorNoise(floor=0.001, growth=0.0005, bias=0.002, bias_width=30.0, flying=0.6, multipath=0.3),
     # Zivid's data sheet of the Two M70: point precision 0.055 mm at 0.7 m.
@@ -116,3 +120,74 @@ def _random_noise(depth: Tensor, normal: Tensor, sensor: SensorNoise) -> Tensor:
         return depth + sensor.sigma(depth) * normal
     disparity = sensor.base / depth + sensor.disparity * normal
     return sensor.base / (torch.round(disparity / sensor.step) * sensor.step).clamp_min(sensor.step)
+
+
+def estimate_noise(
+    depth: Float[Tensor, "h w"], intrinsics: Float[Tensor, "3 3"], table: Plane, on_table: Bool[Tensor, "h w"]
+) -> SensorNoise | None:
+    """Return the noise that a table shows: its random part as `floor` and `growth`, its smooth part as `bias`.
+
+    Args:
+        depth: image [m], 0 where nothing was measured.
+        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels].
+        table: plane in the camera's frame.
+        on_table: pixels that may show the table; those more than 20 mm away from it do not count.
+
+    Returns:
+        The noise of depths; None: fewer than 1000 pixels show the table.
+    """
+    from scipy.ndimage import uniform_filter
+    from scipy.optimize import nnls
+
+    patch, least = 21, 1000  # pixels
+    row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
+    x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
+    a, b, c = table.normal.double().tolist()
+    along = a * x + b * y[:, None] + c  # of a ray with depth 1 and the table's normal
+    error = depth - table.offset / along
+    on = on_table & (depth > 0) & ((error * along).abs() < 0.02)
+    share = torch.from_numpy(uniform_filter(on.double().numpy(), patch))
+    mean = torch.from_numpy(uniform_filter(torch.where(on, error, 0.0).numpy(), patch)) / share.clamp_min(1e-9)
+    on = on & (share > 0.9)  # away from the feet of objects
+    if int(on.sum()) < least:
+        return None
+    z, random = depth[on], (error - mean)[on].abs()
+    groups = torch.argsort(z).tensor_split(8)
+    middle = torch.stack([z[rows].median() for rows in groups])
+    variance = torch.stack([(1.4826 * random[rows].median()).square() for rows in groups])
+    terms = torch.stack([torch.ones_like(middle), middle**4], -1)
+    floor, growth = np.sqrt(nnls(terms.numpy(), variance.numpy())[0]).tolist()
+    bias = 1.4826 * float((mean[on] - mean[on].median()).abs().median())
+    return SensorNoise(floor=floor, growth=growth, bias=bias, bias_width=float(patch))
+
+
+@checked
+def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
+    """Return the median of each pixel in depth images of a camera and a scene that stand still.
+
+    Pixels that most frames miss (0, NaN or infinity) are 0. The unit is that of the frames.
+
+    Args:
+        frames: images (h, w) of one size and one dtype.
+
+    Raises:
+        BadArgument: no frame; frames of several sizes or dtypes; a frame in which camera or scene have moved.
+
+    >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
+    tensor([[0.0000, 0.7010]])
+    """
+    images = [torch.as_tensor(frame) for frame in frames]
+    kinds = sorted({f"{tuple(image.shape)} {image.dtype}" for image in images})
+    if len(kinds) != 1 or images[0].ndim != 2:
+        raise BadArgument("frames", " and ".join(kinds) or "none", "images (h, w) of one size and one dtype")
+    stack = torch.stack(images).double()
+    stack = torch.where(torch.isfinite(stack) & (stack > 0), stack, torch.nan)
+    middle = torch.nanquantile(stack, 0.5, dim=0)
+    for number, frame in enumerate(stack, start=1):
+        off = (frame / middle - 1).abs()
+        share = float((off > 0.02).sum()) / max(1, int(torch.isfinite(off).sum()))
+        if share > 0.05:  # noise and flying pixels change fewer
+            found = f"frame {number} differs by more than 2 % in {share:.0%} of its pixels"
+            raise BadArgument("frames", found, "frames of a camera and a scene that stand still")
+    middle = torch.where(2 * torch.isfinite(stack).sum(0) > len(stack), middle, 0.0)
+    return (middle if images[0].is_floating_point() else torch.round(middle)).to(images[0].dtype)

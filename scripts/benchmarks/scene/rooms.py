@@ -131,7 +131,7 @@ def _holes(rng: np.random.Generator) -> Furniture:
     cells = np.arange(-4, 5) * step
     strips = [_box([step - hole, 0.9, 0.01], [x + step / 2, 0, -0.005]) for x in cells[:-1]]
     bars = [_box([hole, step - hole, 0.01], [x, y + step / 2, -0.005]) for x in cells for y in cells[:-1]]
-    top = trimesh.util.concatenate([*strips, *bars])
+    top = _join(*strips, *bars)
     return [("table", top), ("floor", _floor(-0.5))], 0.25, ((0, 360), (35, 55), (0.6, 0.9)), (0.0, 0.0, 0.0)
 
 
@@ -144,7 +144,7 @@ def _bin(rng: np.random.Generator) -> Furniture:
     long, wide, high = rng.uniform(0.45, 0.6), rng.uniform(0.35, 0.45), rng.uniform(0.08, 0.16)
     sides = [_box([0.01, long, high], [x * wide / 2, 0, high / 2]) for x in (-1, 1)]
     sides += [_box([wide, 0.01, high], [0, y * long / 2, high / 2]) for y in (-1, 1)]
-    parts = [("table", _box([wide, long, 0.01], [0, 0, -0.005])), ("bin", trimesh.util.concatenate(sides))]
+    parts = [("table", _box([wide, long, 0.01], [0, 0, -0.005])), ("bin", _join(*sides))]
     parts.append(("floor", _floor(-rng.choice([0.02, 0.5]))))
     return parts, wide / 2 - 0.04, ((0, 360), (50, 70), (0.6, 0.9)), (0.0, 0.0, 0.0)
 
@@ -184,6 +184,12 @@ tilted board, and the ground itself."""
 
 def _box(size: list[float], centre: list[float]) -> trimesh.Trimesh:
     return trimesh.creation.box(size).apply_translation(centre)
+
+
+def _join(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(list(meshes))
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
 
 
 def _floor(height: float) -> trimesh.Trimesh:
@@ -242,7 +248,7 @@ def _mug(rng: np.random.Generator) -> trimesh.Trimesh:
         rigid(rotation_from_vector(torch.tensor([math.pi / 2, 0.0, 0.0]).double()), torch.zeros(3).double()).numpy()
     )
     handle = handle.slice_plane([0, 0, 0], [1, 0, 0]).apply_translation([radius - 0.003, 0, high / 2])
-    mug = trimesh.util.concatenate([_vessel(radius, radius, high), handle])
+    mug = _join(_vessel(radius, radius, high), handle)
     return mug.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * math.pi), [0, 0, 1]))
 
 
@@ -270,7 +276,7 @@ def _ring(rng: np.random.Generator) -> trimesh.Trimesh:
 def _bridge(rng: np.random.Generator) -> trimesh.Trimesh:
     span, high = rng.uniform(0.07, 0.1), rng.uniform(0.06, 0.09)
     legs = [_box([0.02, 0.04, high], [x * span / 2, 0, high / 2]) for x in (-1, 1)]
-    return trimesh.util.concatenate([*legs, _box([span + 0.02, 0.04, 0.02], [0, 0, high - 0.01])])
+    return _join(*legs, _box([span + 0.02, 0.04, 0.02], [0, 0, high - 0.01]))
 
 
 THINGS: dict[str, Callable[[np.random.Generator], trimesh.Trimesh]] = {
