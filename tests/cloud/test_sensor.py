@@ -1,15 +1,19 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.camera import look_at, partial_view, render_depth
-from torchgrasp.cloud.sensor import ACTIVE_STEREO, SENSORS, SensorNoise, add_noise
+from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
+from torchgrasp.cloud.sensor import ACTIVE_STEREO, SENSORS, SensorNoise, add_noise, estimate_noise, median_depth
 from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.plane import Plane
 
 NAMES = ["active stereo", *SENSORS]
+BRICK = trimesh.creation.box([0.1, 0.1, 0.1]).apply_translation([0.0, 0.0, 0.05])
 
 
 def sensor(name: str) -> SensorNoise:
@@ -79,3 +83,53 @@ def test_an_unknown_camera_is_refused_by_name():
     ball = trimesh.creation.icosphere(radius=0.04)
     with pytest.raises(BadArgument, match="noise"):
         partial_view(ball, look_at(0.0, 30.0), noise="sony")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_the_noise_of_a_sensor_is_estimated_from_its_table(name):
+    pose, noise = look_at(20.0, 45.0, 0.7), SENSORS[name]
+    table = Plane.horizontal(0.0).moved(inverse(pose))
+    depth, labels = render_depth([BRICK], pose, noise=name)
+    found = estimate_noise(depth, INTRINSICS, table, labels == 0)
+    z = torch.tensor(0.7)
+    step = noise.step * 0.7**2 / noise.base if noise.base else 0.0
+    true = torch.hypot(noise.sigma(z), torch.tensor(step / math.sqrt(12)))
+    whole = math.hypot(float(true), noise.bias)  # patches of noise count as noise or as bias
+    assert math.hypot(float(found.sigma(z)), found.bias) == pytest.approx(whole, rel=0.3)
+    assert 0.4 * true < found.sigma(z) < 1.5 * true
+    assert estimate_noise(depth, INTRINSICS, table, labels == 1) is None
+
+
+def frames(count: int, pose):
+    return [render_depth([BRICK], pose, noise="kinect_v1", seed=seed)[0] for seed in range(count)]
+
+
+def test_the_median_of_frames_has_less_noise_and_fewer_holes():
+    pose = look_at(20.0, 45.0, 0.7)
+    seen, exact = frames(5, pose), render_depth([BRICK], pose, noise=False)[0]
+    middle = median_depth(seen)
+
+    def error(depth):
+        return float((depth - exact)[(depth > 0) & (exact > 0)].abs().median())
+
+    assert error(middle) < 0.6 * error(seen[0])
+    assert int(((middle == 0) & (exact > 0)).sum()) < 0.7 * int(((seen[0] == 0) & (exact > 0)).sum())
+    assert not bool(middle[exact == 0].any())
+
+
+def test_the_median_keeps_counts_and_drops_what_most_frames_miss():
+    images = [np.array([[700, 0, 500]], dtype=np.uint16), np.array([[702, 0, 0]], dtype=np.uint16)]
+    images += [np.array([[701, 300, 0]], dtype=np.uint16)]
+    middle = median_depth(images)
+    assert middle.dtype == torch.uint16
+    assert middle.tolist() == [[701, 0, 0]]
+
+
+def test_frames_of_a_moved_camera_or_of_several_sizes_are_refused():
+    still = frames(2, look_at(20.0, 45.0, 0.7))
+    with pytest.raises(BadArgument, match=r"frames: .*stands? still, got frame 3 differs"):
+        median_depth([*still, frames(1, look_at(20.0, 45.0, 0.75))[0]])
+    with pytest.raises(BadArgument, match="one size"):
+        median_depth([still[0], still[1][:100]])
+    with pytest.raises(BadArgument, match="got none"):
+        median_depth([])

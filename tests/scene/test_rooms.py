@@ -34,3 +34,23 @@ def test_a_room_is_repeatable():
     assert torch.equal(first.depth, second.depth)
     assert first.names == second.names
     assert not torch.equal(first.depth, rooms(11).depth)
+
+
+@functools.cache
+def understood(seed: int) -> Understood:
+    return understand(rooms(seed))
+
+
+@pytest.mark.parametrize("seed", [0, 24, 9, 17, 10, 26, 3, 19, 28, 29, 14, 30, 7, 31])  # each kind, each camera
+def test_the_table_of_a_room_is_within_2_degrees_and_10_mm(seed):
+    assert understood(seed).right
+
+
+@pytest.mark.parametrize("seed", [0, 17, 10, 26, 3, 19, 29, 14, 30, 7, 31])
+def test_each_lone_thing_of_a_room_is_one_thing(seed):
+    assert set(understood(seed).lone.values()) == {"one"}
+
+
+@pytest.mark.parametrize("seed", [24, 9, 26, 30])
+def test_furniture_is_no_thing(seed):
+    assert understood(seed).extra == ()

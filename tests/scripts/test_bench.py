@@ -24,7 +24,7 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import solve_closure_lp, wrenches
 
-RUNS = ("gpu/kernels", "hand/collision", "load/starts", "plan/truth", "scene/plane")
+RUNS = ("gpu/kernels", "hand/collision", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
 SIMULATED = ("close/perturb", "grasp/lifts")
 
 
