@@ -214,7 +214,9 @@ def look_around(o: Options) -> list[Row]:
     seconds = sorted(one.seconds for _, one in seen)
     right, offered = len(seen) - len(wrong), sum(one.offered for _, one in seen)
     where = f"{len(seen)} rendered rooms, RealSense, Kinect v1, Azure Kinect, Zivid"
-    numbers = [(i, room.kind, room.sensor, dataclasses.asdict(one)) for i, (room, one) in zip(scenes, seen, strict=True)]
+    numbers = [
+        (i, room.kind, room.sensor, dataclasses.asdict(one)) for i, (room, one) in zip(scenes, seen, strict=True)
+    ]
     return [
         Row(
             f"table, {where}",
