@@ -4,6 +4,7 @@ import functools
 
 import pytest
 import torch
+from benchmarks.scene.read import Understood, understand
 from benchmarks.scene.rooms import KINDS, Room, rooms
 
 from torchgrasp.scene.image import DepthImage

@@ -144,8 +144,8 @@ class Understood:
     """What `Scene.from_depth` understood of a room.
 
     `degrees` and `mm` are the errors of the table; infinite where no table is found. `offered` tells whether one of the
-    supports is right. `lone` has the fate of each lone thing: "one", "split", "joined" or "missed". `extra` has the name
-    of the furniture, and the number of pixels, of each other object of more than 100 pixels.
+    supports is right. `lone` has the fate of each lone thing: "one", "split", "joined" or "missed". `extra` has the
+    furniture's name and the number of pixels of each other object of more than 100 pixels.
     """
 
     degrees: float
