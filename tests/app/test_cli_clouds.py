@@ -8,11 +8,12 @@ import torch
 import trimesh
 from PIL import Image
 
+from tests.make import box
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasps
 from torchgrasp.app.cli.inputs import CloudOptions
 from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
-from torchgrasp.cloud.camera import INTRINSICS
+from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.cloud.check import remove_outliers
 from torchgrasp.data.shipped import DATA, load_object, load_scene
 from torchgrasp.errors import BadArgument
@@ -274,6 +275,29 @@ def test_scene_is_that_of_the_depth_image(tmp_path, capsys):
     np.save(tmp_path / "mask.npy", shipped.image.depth.numpy() < 0)
     assert cli.main([*words, "--mask", str(tmp_path / "mask.npy")]) == 2
     assert "--mask" in capsys.readouterr().err
+
+
+def test_scene_takes_the_median_of_frames_of_a_still_camera(tmp_path, capsys):
+    meshes = [box([0.06, 0.06, 0.1], (0.0, 0.0)), box([0.05, 0.08, 0.06], (0.1, 0.12))]
+    poses = [look_at(20.0, 45.0, 0.7)] * 3 + [look_at(20.0, 45.0, 0.8)]
+    paths = [str(tmp_path / f"{seed}.png") for seed in range(len(poses))]
+    for seed, (path, pose) in enumerate(zip(paths, poses, strict=True)):
+        depth = render_depth(meshes, pose, noise="azure", seed=seed)[0]
+        Image.fromarray(np.uint16(torch.round(1e3 * depth).numpy())).save(path)
+    words = ["cloud", "scene", paths[0], "--intrinsics", "616", "616", "319.5", "239.5", "--out"]
+    noise = []
+    for frames in ([], ["--frames", *paths[1:3]]):
+        assert cli.main([*words, str(tmp_path / "scene.npz"), *frames]) == 0
+        assert "noise: " in capsys.readouterr().out
+        found = read_scene(tmp_path / "scene.npz")
+        assert found.things[:2] == (1, 2) and found.noise is not None
+        noise.append(float(found.noise.sigma(torch.tensor(0.7))))
+    assert noise[1] < 0.9 * noise[0]
+    assert cli.main([*words, str(tmp_path / "moved.npz"), "--frames", *paths[1:]]) == 2
+    assert "--frames: expected frames of a camera and a scene that stand still" in capsys.readouterr().err
+    assert not (tmp_path / "moved.npz").exists()
+    assert cli.main([*words, str(tmp_path / "1.npz"), "--frames", paths[1]]) == 2
+    assert "replace" in capsys.readouterr().err
 
 
 def test_scene_draws_a_picture_beside_it_that_replaces_no_input(tmp_path, capsys):

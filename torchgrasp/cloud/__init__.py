@@ -9,12 +9,14 @@ from torchgrasp.cloud.prepare import merge_clouds
 from torchgrasp.cloud.parts import cut_object
 from torchgrasp.cloud.prepare import NormalCheck, estimate_normals
 from torchgrasp.cloud.read import CloudFile, cloud_from_array, read_cloud, read_cloud_file, save_cloud
+from torchgrasp.cloud.sensor import SensorNoise, median_depth
 
 __all__ = [
     "Advice",
     "CloudFile",
     "CloudReport",
     "NormalCheck",
+    "SensorNoise",
     "check_cloud",
     "cloud_from_array",
     "cloud_from_depth",
@@ -23,6 +25,7 @@ __all__ = [
     "estimate_normals",
     "format_report",
     "look_at",
+    "median_depth",
     "merge_clouds",
     "partial_view",
     "read_cloud",

@@ -45,7 +45,8 @@ class SensorNoise(Value):
     grazing: tuple[float, float] = (72.5, 87.0)  # angle of ray and normal [deg] at which pixels fade, and are gone
     multipath: float = 0.0  # excess of depth in a corner, over the corner's depth behind its surroundings
 
-    def sigma(self, depth: Tensor) -> Tensor:
+    @checked
+    def sigma(self, depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return the standard deviation [m] of the random noise at a depth [m], without bias and steps."""
         growth = self.disparity / self.base if self.base else self.growth
         return torch.sqrt(self.floor**2 + (growth * depth * depth) ** 2)
@@ -176,7 +177,10 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
     >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
     tensor([[0.0000, 0.7010]])
     """
-    images = [torch.as_tensor(frame) for frame in frames]
+    images = [
+        frame if isinstance(frame, Tensor) else torch.from_numpy(np.array(frame, frame.dtype.newbyteorder("=")))
+        for frame in frames
+    ]
     kinds = sorted({f"{tuple(image.shape)} {image.dtype}" for image in images})
     if len(kinds) != 1 or images[0].ndim != 2:
         raise BadArgument("frames", " and ".join(kinds) or "none", "images (h, w) of one size and one dtype")

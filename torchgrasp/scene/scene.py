@@ -11,8 +11,10 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, checked
 from torchgrasp.cloud.depth import read_depth
+from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.cloud.support import find_table
 from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, to_upright
 from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image, read_labels
 from torchgrasp.scene.segment import label_image
@@ -210,6 +212,17 @@ class Scene(Value):
     def supports(self) -> tuple[Plane, ...]:
         """The planes that objects could stand on, the table first."""
         return () if self.table is None else (self.table, *self.others)
+
+    @property
+    def noise(self) -> SensorNoise | None:
+        """The camera's noise, estimated from the table; None: an unknown table, or too few pixels show it."""
+        if self.table is None:
+            return None
+        image, rows = self.image, self.pixels[self.labels == 0]
+        on_table = torch.zeros(image.depth.shape, dtype=torch.bool)
+        on_table[rows[:, 0], rows[:, 1]] = True
+        in_camera = self.table.moved(inverse(image.obj_from_camera))
+        return estimate_noise(image.depth, image.intrinsics, in_camera, on_table)
 
     @property
     def viewpoint(self) -> Float[Tensor, "3"]:

@@ -47,8 +47,9 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     thin = _components(risen & (pieces == 0), smooth.depth, jump)
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
-    # A tenth of an object's pixels are 3.5 mm high; an uneven table is not.
-    high = _counts(torch.where(mean > 0.0035, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
+    # A tenth of an object's pixels are 3.5 mm high and four deviations of the noise; an uneven table is not.
+    lifted = mean > (1.6 * threshold).clamp_min(0.0035)
+    high = _counts(torch.where(lifted, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
     few = _counts(torch.where(sure, pieces, 0), len(high)) < FEW
     over = pieces[pieces > 0][support.covers(points[pieces > 0])]
     beside = _counts(over, len(high)) < 0.2 * _counts(pieces)

@@ -31,6 +31,7 @@ from torchgrasp.cloud import (
 from torchgrasp.cloud.depth import read_image, read_pose
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.cloud.prepare import prepare_cloud
+from torchgrasp.cloud.sensor import median_depth
 from torchgrasp.data import write_objects
 from torchgrasp.errors import BadArgument
 from torchgrasp.export import check_surface_path, largest_std, save_surface
@@ -132,12 +133,18 @@ class _DepthCommand(Command):
     camera_pose: Path | None = option(
         None, "file with frame_from_camera, 4 x 4 (.npy or .txt); by default results are in the camera's frame"
     )
+    frames: tuple[Path, ...] = option(
+        (), "more depth images of the camera, which stands still: the median of each pixel has less noise"
+    )
 
     def images(self):
         """Return the depth image, the mask and the camera pose; None where not given."""
         mask = None if self.mask is None else read_image("mask", self.mask)
         pose = None if self.camera_pose is None else read_pose("camera_pose", self.camera_pose)
-        return read_image("depth", self.depth), mask, pose
+        depth = read_image("depth", self.depth)
+        if self.frames:
+            depth = median_depth([depth, *(read_image("depth", path) for path in self.frames)])
+        return depth, mask, pose
 
 
 @arguments()
@@ -163,7 +170,7 @@ class CloudScene(_DepthCommand):
     def run(self) -> int:
         """Find the table and the objects, write the scene and its picture; return the exit code."""
         picture = self.out.with_suffix(".png")
-        if picture.resolve() in [path.resolve() for path in (self.depth, self.mask) if path is not None]:
+        if picture.resolve() in [path.resolve() for path in (self.depth, self.mask, *self.frames) if path]:
             raise BadArgument("--out", f"{self.out}, whose picture would replace {picture}", "another name")
         depth, mask, pose = self.images()
         seen = Scene.from_depth(depth, self.intrinsics, pose, mask=mask)
@@ -171,12 +178,11 @@ class CloudScene(_DepthCommand):
         draw_scene(seen, picture)
         for label in seen.things:
             print(f"object {label}: {int(seen.rows_of(label).sum())} points{' (the target)' * (label == seen.target)}")
-        table = "unknown" if seen.table is None else seen.table.describe()
-        print(
-            "\n".join(
-                [f"table: {table}", *(f"advice: {sentence}" for sentence in seen.advice), f"{self.out}, {picture}"]
-            )
-        )
+        said = [f"table: {'unknown' if seen.table is None else seen.table.describe()}"]
+        if seen.noise is not None:
+            random = 1e3 * float(seen.noise.sigma(seen.image.depth[seen.image.depth > 0].median()))
+            said.append(f"noise: {random:.1f} mm of single pixels, {1e3 * seen.noise.bias:.1f} mm of patches")
+        print(*said, *(f"advice: {sentence}" for sentence in seen.advice), f"{self.out}, {picture}", sep="\n")
         return 0
 
 
