@@ -138,7 +138,6 @@ def estimate_noise(
         The noise of depths; None: fewer than 1000 pixels show the table.
     """
     from scipy.ndimage import uniform_filter
-    from scipy.optimize import nnls
 
     patch, least = 21, 1000  # pixels
     row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
@@ -152,14 +151,23 @@ def estimate_noise(
     on = on & (share > 0.9)  # away from the feet of objects
     if int(on.sum()) < least:
         return None
-    z, random = depth[on], (error - mean)[on].abs()
-    groups = torch.argsort(z).tensor_split(8)
-    middle = torch.stack([z[rows].median() for rows in groups])
-    variance = torch.stack([(1.4826 * random[rows].median()).square() for rows in groups])
+    random = fit_noise(depth[on], (error - mean)[on])
+    bias = 1.4826 * float((mean[on] - mean[on].median()).abs().median())
+    return dataclasses.replace(random, bias=bias, bias_width=float(patch))
+
+
+def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoise:
+    """Return the `floor` and `growth` of errors [m] about 0, of which some are outliers, at depths [m]."""
+    from scipy.optimize import nnls
+
+    if len(depth) < 100:
+        return SensorNoise()
+    groups = torch.argsort(depth).tensor_split(8)
+    middle = torch.stack([depth[rows].median() for rows in groups])
+    variance = torch.stack([(1.4826 * error[rows].abs().median()).square() for rows in groups])
     terms = torch.stack([torch.ones_like(middle), middle**4], -1)
     floor, growth = np.sqrt(nnls(terms.numpy(), variance.numpy())[0]).tolist()
-    bias = 1.4826 * float((mean[on] - mean[on].median()).abs().median())
-    return SensorNoise(floor=floor, growth=growth, bias=bias, bias_width=float(patch))
+    return SensorNoise(floor=floor, growth=growth)
 
 
 @checked

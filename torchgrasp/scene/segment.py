@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.cloud.sensor import fit_noise
 from torchgrasp.cloud.support import Support
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
@@ -48,7 +49,9 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
     # A tenth of an object's pixels are 3.5 mm high and four deviations of the noise; an uneven table is not.
-    lifted = mean > (1.6 * threshold).clamp_min(0.0035)
+    flat = measured & (mean.abs() < BAND)
+    noise = fit_noise(image.depth[flat], mean[flat]).sigma(image.depth)
+    lifted = mean > (4 * noise).clamp_min(0.0035)
     high = _counts(torch.where(lifted, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
     few = _counts(torch.where(sure, pieces, 0), len(high)) < FEW
     over = pieces[pieces > 0][support.covers(points[pieces > 0])]

@@ -168,6 +168,11 @@ def _ground(rng: np.random.Generator) -> Furniture:
     return parts, 0.25, ((-45, 45), (30, 55), (0.7, 1.0)), (0.0, 0.0, 0.0)
 
 
+def _above(rng: np.random.Generator) -> Furniture:
+    parts = [("table", _box([0.9, 0.9, 0.03], [0, 0, -0.015])), ("floor", _floor(-rng.uniform(0.4, 0.75)))]
+    return parts, 0.22, ((0, 360), (78, 89), (0.6, 0.9)), (0.0, 0.0, 0.0)
+
+
 KINDS: dict[str, Callable[[np.random.Generator], Furniture]] = {
     "round": _round,
     "rectangular": _rectangular,
@@ -177,9 +182,10 @@ KINDS: dict[str, Callable[[np.random.Generator], Furniture]] = {
     "shelf": _shelf,
     "board": _board,
     "ground": _ground,
+    "above": _above,
 }
 """Kinds of rooms: a round or rectangular table over a floor, a plate with holes, a table at a wall, a bin, a shelf, a
-tilted board, and the ground itself."""
+tilted board, the ground itself, and a table from above."""
 
 
 def _box(size: list[float], centre: list[float]) -> trimesh.Trimesh:
