@@ -10,7 +10,7 @@ from torch import Tensor
 
 NOISE, NOISE_GROWTH = 0.001, 0.0035
 """Assumed noise [m] of a depth camera, and its growth with the squared distance [1/m]."""
-ROUGH = 1.4  # a greater scale of the residuals, over the assumed noise, belongs to no flat plane
+ROUGH = 2.5  # a greater scale of the residuals, over the assumed noise, belongs to no flat plane
 LEAST_SHARE = 0.05  # least share of the points on a plane
 REACH = 0.30  # height [m] of objects above a plane
 MOST_TILT = 30.0  # greatest angle [deg] between the normal and `up`
@@ -107,7 +107,7 @@ def _refine(view: View, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
     for _ in range(30):
         ratio = (points @ normal - offset) / noise
         core = ratio.abs() < 3 * scale
-        scale = min(max(float(1.4826 * ratio[core].abs().median()), 0.2), ROUGH) if bool(core.any()) else scale
+        scale = min(max(float(3.14 * ratio[core].abs().quantile(0.25)), 0.2), ROUGH) if bool(core.any()) else scale
         weight = (1 - (ratio / (4.685 * scale)).square()).clamp_min(0).square() / noise.square()
         weight = weight / weight.sum()
         mean = weight @ points
