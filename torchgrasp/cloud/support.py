@@ -272,11 +272,11 @@ def _judge(view: View, fit: PlaneFit) -> _Candidate | str:
     through = int((behind & (height < -tolerance) & support.covers(crossing, -inner)).sum())
     if through > MOST_THROUGH * fit.count:
         return f"a plane with {share:.0%} of the points, but {through / len(points):.0%} of them below it"
-    steep = view.eye is not None and float(unit(view.eye - middle) @ fit.normal) > 0.9  # it hides the feet of objects
-    low = (height > tolerance) & (height < (REACH if steep else LOW))
     # Low points of an object are over the plane's own region. A pan's rim is not over its floor.
-    standing = int((low & support.covers(points, -inner)).sum())
-    if standing < LEAST_STANDING * len(points) or standing < 0.05 * int(low.sum()):
+    over = (height > tolerance) & (height < REACH) & support.covers(points, -inner)
+    low, standing = int(((height > tolerance) & (height < LOW)).sum()), int((over & (height < LOW)).sum())
+    steep = view.eye is not None and float(unit(view.eye - middle) @ fit.normal) > 0.9  # it hides the feet of objects
+    if (int(over.sum()) if steep else standing) < max(LEAST_STANDING * len(points), 0.05 * low):
         return f"a plane with {share:.0%} of the points and nothing that stands on it"
     return _Candidate(support, standing * (2.0 if _looked_at(view, fit, support) else 1.0), middle)
 

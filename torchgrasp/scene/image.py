@@ -97,6 +97,14 @@ def read_labels(labels: Tensor | np.ndarray, shape: tuple[int, ...]) -> Int[Tens
     return read.long().cpu()
 
 
+def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
+    """Return the root mean square distance [m] of each label's points from their middle."""
+    label, own = labels.reshape(-1), points.reshape(-1, 3)
+    count = torch.bincount(label).clamp_min(1)
+    mean = torch.stack([torch.bincount(label, weights=x) / count for x in own.unbind(-1)], -1)
+    return (torch.bincount(label, weights=(own - mean[label]).square().sum(-1)) / count).sqrt()
+
+
 def image_of_cloud(
     points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], up: Float[Tensor, "3"]
 ) -> tuple[DepthImage, Int[Tensor, "n 2"]]:

@@ -15,7 +15,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
+from torchgrasp.scene.image import LEAST_PIXELS, DepthImage, label_radii
 
 BAND = 0.010  # heights [m] below this, of either sign, measure the noise of the table
 LEAST_HEIGHT = 0.002  # least height [m] of an object's pixels above the table
@@ -24,6 +24,7 @@ FEW = 6  # pieces with fewer pixels are noise
 GAP, TOUCH, FLOATING_GAP = 0.008, 3, 0.013
 """Pieces touch where TOUCH pixels are within GAP [m]; a floating piece belongs to one within FLOATING_GAP [m]."""
 OVERHANG = 0.05  # distance [m] to which an object extends beyond the visible region of its support
+VAST = 0.2  # greatest root mean square distance [m] of an object's points from their middle; a wall has more
 MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a box drawn around an object are
 
 
@@ -35,8 +36,7 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
 
     Args:
         image: one view of the scene.
-        support: the plane that the objects stand on, in the frame of the image, and its region. A wall, or a chair
-            behind the table, is beside the region: it is no object.
+        support: the plane that the objects stand on, in the frame of the image; what is beside its region is no object.
     """
     table, points = support.plane, image.points()
     measured, smooth = image.depth > 0, image.without_speckle()
@@ -49,14 +49,14 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
     # A tenth of an object's pixels are 3.5 mm high and four deviations of the noise; an uneven table is not.
-    flat = measured & (mean.abs() < BAND)
+    flat, whole = measured & (mean.abs() < BAND), _counts(pieces)
     noise = fit_noise(image.depth[flat], mean[flat]).sigma(image.depth)
-    lifted = mean > (4 * noise).clamp_min(0.0035)
-    high = _counts(torch.where(lifted, pieces, 0), len(_counts(pieces))) >= 0.1 * _counts(pieces)
+    high = _counts(torch.where(mean > (4 * noise).clamp_min(0.0035), pieces, 0), len(whole)) >= 0.1 * whole
     few = _counts(torch.where(sure, pieces, 0), len(high)) < FEW
     over = pieces[pieces > 0][support.covers(points[pieces > 0])]
-    beside = _counts(over, len(high)) < 0.2 * _counts(pieces)
-    pieces = torch.where((few | ~high | beside)[pieces], 0, pieces)
+    beside = _counts(over, len(high)) < 0.2 * whole
+    vast = label_radii(points, pieces) > VAST
+    pieces = torch.where((few | ~high | beside | vast)[pieces], 0, pieces)
     group = _merge(smooth, torch.where(sure, pieces, 0), table, jump)
     return _numbered(_filled(group[pieces], measured, table.height(points)))
 
