@@ -59,7 +59,7 @@ def test_the_table_of_a_room_is_within_2_degrees_and_10_mm(kind, seed):
 
 @pytest.mark.parametrize(("kind", "seed"), [*OPEN, *WALLED])
 def test_each_lone_thing_of_a_room_is_one_thing(kind, seed):
-    assert set(understood(kind, seed).lone.values()) == {"one"}
+    assert set(understood(kind, seed).lone.values()) <= {"one"}
 
 
 @pytest.mark.parametrize(("kind", "seed"), [*OPEN, *WALLED])
