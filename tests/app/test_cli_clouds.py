@@ -1,6 +1,8 @@
 """The commands for clouds, and what `grasp` and `cloud check` say of clouds as users bring them."""
 
 import functools
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from torchgrasp.app.cli.inputs import CloudOptions
 from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.cloud.check import remove_outliers
+from torchgrasp.cloud.tables import read_image
 from torchgrasp.data.shipped import DATA, load_object, load_scene
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, as_plane
@@ -390,6 +393,81 @@ def test_bad_depth_is_refused_in_one_sentence(name, tmp_path, refusal):
 def test_malformed_depth_files_are_refused_by_name(suffix, content, tmp_path, refusal):
     (tmp_path / f"d{suffix}").write_bytes(content)
     assert refusal("cloud", "depth", tmp_path / f"d{suffix}", *K, "--out", tmp_path / "c.npz").startswith("DEPTH: ")
+
+
+CAMERAS = {  # files that ROS, BOP and others write
+    "info.yaml": "image_width: 640\nimage_height: 480\ncamera_matrix: {rows: 3, cols: 3, data: MATRIX}\n---\n",
+    "scene_camera.json": '{"0": {"cam_K": [1, 2]}, "7": {"cam_K": MATRIX, "depth_scale": 1.0}}',
+    "k.txt": "616 0 319.5\n0 616 239.5\n0 0 1\n",
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_intrinsics_are_read_from_a_file(name, tmp_path, run_command):
+    depth, mask = depth_image()
+    Image.fromarray(np.nan_to_num(1000 * depth).astype(np.uint16)).save(tmp_path / "000007.png")
+    np.save(tmp_path / "m.npy", mask)
+    (tmp_path / name).write_text(CAMERAS[name].replace("MATRIX", str([616, 0, 319.5, 0, 616, 239.5, 0, 0, 1])))
+    words = ["cloud", "depth", tmp_path / "000007.png", "--mask", tmp_path / "m.npy"]
+    for k, out in ((K[1:], "a.npz"), ([tmp_path / name], "b.npz")):
+        assert run_command(*words, "--intrinsics", *k, "--out", tmp_path / out)[0] == 0
+    assert torch.equal(read_cloud(tmp_path / "a.npz").points, read_cloud(tmp_path / "b.npz").points)
+
+
+BAD_CAMERAS = {
+    "a.json": (b"{", "well-formed .json"),
+    "b.json": (b'{"0": {"cam_K": [1]}, "1": {}}', "the entry of this image"),
+    "c.yaml": (b"!!python/object/apply:os.getcwd []", "well-formed .yaml"),
+    "d.yaml": (b"k: &k {k: *k}", "matrix K"),
+    "e.yaml": (b"a: &a [1, 1, 1, 1]\nb: &b [*a, *a, *a, *a]\nk: [*b, *b, *b]", "matrix K"),
+    "f.json": (b'{"K": [1232, 0, 639, 0, 1232, 479, 0, 0, 1], "width": 1280, "height": 960}', "all four times 0.5"),
+    "g.toml": (b"k = 1", ".json"),
+    "word": (None, "no file"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_CAMERAS)
+def test_a_bad_file_of_intrinsics_is_refused_in_one_sentence(name, tmp_path, refusal):
+    np.save(tmp_path / "d.npy", depth_image()[0])
+    if BAD_CAMERAS[name][0] is not None:
+        (tmp_path / name).write_bytes(BAD_CAMERAS[name][0])
+    words = ["cloud", "depth", tmp_path / "d.npy", "--out", tmp_path / "c.npz"]
+    error = refusal(*words, "--intrinsics", tmp_path / name)
+    assert error.startswith("--intrinsics: ") and BAD_CAMERAS[name][1] in error
+    assert "fx fy cx cy" in refusal(*words, "--intrinsics", "616", "616", "a", "b")
+
+
+@pytest.mark.parametrize("unit", [None, "0.00025", "0.001"])
+def test_a_tiff_and_its_unit_are_read(unit, tmp_path, run_command):
+    depth, mask = depth_image()
+    counts = np.nan_to_num(depth) / float(unit or 1)
+    Image.fromarray(counts.astype(np.uint16) if unit == "0.00025" else counts.astype(np.float32)).save(
+        tmp_path / "d.tiff"
+    )
+    np.save(tmp_path / "m.npy", mask)
+    options = ["--mask", tmp_path / "m.npy", *K, *([] if unit is None else ["--depth-unit", unit])]
+    assert run_command("cloud", "depth", tmp_path / "d.tiff", *options, "--out", tmp_path / "c.npz")[0] == 0
+    assert np.allclose(read_cloud(tmp_path / "c.npz").points[:, 2], 0.4, atol=1e-6)
+
+
+def test_exr_needs_a_package_and_a_unit_is_small(tmp_path, refusal, monkeypatch):
+    (tmp_path / "d.exr").write_bytes(b"v/1\x01")
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    words = ["cloud", "depth", tmp_path / "d.exr", *K, "--out", tmp_path / "c.npz"]
+    assert "pip install OpenEXR" in refusal(*words)
+    assert refusal(*words, "--depth-unit", "4000").startswith("--depth-unit")
+
+
+def test_exr_gives_its_channel_of_depth(tmp_path, monkeypatch):
+    depth = np.full((4, 6), 0.5, dtype=np.float32)
+    channels = {"RGB": SimpleNamespace(pixels=np.zeros((4, 6, 3))), "View.Depth.Z": SimpleNamespace(pixels=depth)}
+    package = SimpleNamespace(File=lambda path: SimpleNamespace(channels=lambda: channels))
+    monkeypatch.setitem(sys.modules, "OpenEXR", package)
+    (tmp_path / "d.exr").write_bytes(b"v/1\x01")
+    assert np.array_equal(read_image("depth", tmp_path / "d.exr"), depth)
+    channels["Other.Z"] = channels["RGB"]
+    with pytest.raises(BadArgument, match="channels"):
+        read_image("depth", tmp_path / "d.exr")
 
 
 @pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0)])

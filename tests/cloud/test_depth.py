@@ -9,6 +9,11 @@ from torchgrasp.geometry.frames import rigid, rotation_from_vector
 K = torch.tensor([[600.0, 0, 30], [0, 550.0, 20], [0, 0, 1]], dtype=torch.float64)
 
 
+def camera(width, height):
+    """A camera of a resolution, as RealSense describes it."""
+    return {"fx": 600.0, "fy": 600.0, "ppx": width / 2, "ppy": height / 2, "width": width, "height": height}
+
+
 def tilted_depth():
     """Depth of the plane n.p = 0.5 for n = (0.1, -0.2, 1), in closed form."""
     v, u = torch.meshgrid(torch.arange(48.0).double(), torch.arange(64.0).double(), indexing="ij")
@@ -75,7 +80,20 @@ REFUSED = {
     "floating mask": (lambda d: (d, K, d), "mask.*bool or uint8"),
     "intrinsics of twice the size": (lambda d: (d, (1200.0, 1100.0, 64.0, 48.0)), r"intrinsics.*\(64.0, 48.0\) px"),
     "intrinsics of half the size": (lambda d: (d, (300.0, 275.0, 16.0, 12.0)), "intrinsics.*same resolution"),
-    "intrinsics of 848 x 480 for 640 x 480": (lambda d: (d, (600.0, 600.0, 42.4, 24.0)), "intrinsics.*same resolution"),
+    "depth in cm": (lambda d: (100 * d + 30, K), "depth.*are these cm.*depth_unit=0.01"),
+    "depth in tens of metres": (lambda d: (d / 100, K), "depth.*depth_unit"),
+    "a dict without a camera": (lambda d: (d, {"fps": 30}), "intrinsics.*a dict of fps"),
+    "a dict of words": (lambda d: (d, {"fx": "a", "fy": 1, "cx": 1, "cy": 1}), "intrinsics.*fx, fy, cx and cy"),
+    "BOP of many images": (lambda d: (d, {"0": {"cam_K": [1] * 9}, "1": {}}), "intrinsics.*the entry of this image"),
+    "a width that is no number": (lambda d: (d, {"K": K.numpy(), "width": "64", "height": 48}), "positive width"),
+    "normalised intrinsics": (lambda d: (d, (0.96, 0.96, 0.5, 0.5)), "intrinsics.*multiply normalised"),
+    "a focal length in mm": (lambda d: (d, (1.93, 1.93, 32.0, 24.0)), "intrinsics.*view of 1.. degrees"),
+    "fx cx fy cy": (lambda d: (d, (600.0, 31.0, 600.0, 24.0)), "intrinsics.*the order fx, fy, cx, cy"),
+    "cx cy fx fy": (lambda d: (d, (31.0, 24.0, 600.0, 600.0)), "intrinsics.*the order fx, fy, cx, cy"),
+    "the second camera's projection": (lambda d: (d, [600, 0, 31, -30, 0, 600, 24, 0, 0, 0, 1, 0]), "fourth column"),
+    "a camera of twice the size": (lambda d: (d, camera(128, 96)), r"an image of 128 x 96 px.*|times 0\.5"),
+    "a camera of another ratio": (lambda d: (d, camera(85, 48)), "an image of 85 x 48 px"),
+    "a camera that is turned": (lambda d: (d, camera(48, 64)), "the transposed image"),
     "transposed intrinsics": (lambda d: (d, K.T), "intrinsics.*fx, fy"),
     "three intrinsics": (lambda d: (d, (600.0, 30.0, 20.0)), "intrinsics.*fx, fy, cx, cy"),
     "intrinsics of words": (lambda d: (d, ["f", "f", "c", "c"]), "intrinsics"),
@@ -99,3 +117,95 @@ def test_refusals():
     for spoilt in (2 * eye, torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])).double(), eye + torch.nan):
         with pytest.raises(BadArgument, match="camera_pose"):
             cloud_from_depth(depth, K, camera_pose=spoilt)
+
+
+class Ros:  # a message, whose matrix is an array
+    k, width, height = K.numpy().ravel(), 64, 48
+
+
+FORMS = {
+    "matrix": K,
+    "nine numbers": K.ravel().tolist(),
+    "projection": torch.cat([K, torch.zeros(3, 1)], 1).numpy(),
+    "twelve numbers": torch.cat([K, torch.zeros(3, 1)], 1).ravel(),
+    "four numbers": (600, 550, 30, 20),
+    "with the size": (600, 550, 30, 20, 64, 48),
+    "CameraInfo of ROS 1": {"K": K.ravel().tolist(), "width": 64, "height": 48, "D": [0.0] * 5},
+    "message of ROS 2": Ros(),
+    "calibration of ROS": {
+        "image_width": 64,
+        "image_height": 48,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": K.ravel().tolist()},
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
+    },
+    "Open3D": {"width": 64, "height": 48, "intrinsic_matrix": K.T.ravel().tolist()},
+    "RealSense": {"fx": 600.0, "fy": 550.0, "ppx": 30.0, "ppy": 20.0, "width": 64, "height": 48, "coeffs": [0.0] * 5},
+    "Zivid": {"CameraIntrinsics": {"CameraMatrix": {"CX": 30.0, "CY": 20.0, "FX": 600.0, "FY": 550.0}}},
+    "BOP": {"cam_K": K.ravel().tolist(), "depth_scale": 1.0},
+    "BOP of a camera": {"cx": 30, "cy": 20, "fx": 600, "fy": 550, "depth_scale": 1.0, "width": 64, "height": 48},
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_every_form_of_intrinsics_gives_the_same_cloud(name):
+    mm = (1000 * tilted_depth()).numpy().astype(np.uint16)
+    assert torch.equal(cloud_from_depth(mm, FORMS[name]).points, cloud_from_depth(mm, K).points)
+
+
+@pytest.mark.parametrize(
+    ("scale", "camera"),
+    [
+        (0.1, {"cam_K": K.ravel().tolist(), "depth_scale": 0.1}),
+        (0.1, {"fx": 600, "fy": 550, "ppx": 30, "ppy": 20, "depth_scale": 1e-4}),
+        (0.1, {"intrinsic_matrix": K.T.ravel().tolist(), "depth_scale": 1e4}),
+        (0.25, K),
+    ],
+)
+def test_counts_of_a_stated_unit_are_metres(scale, camera):
+    counts = (1000 / scale * tilted_depth()).round().numpy().astype(np.uint16)
+    unit = scale / 1000 if scale == 0.25 else None
+    assert np.allclose(read_depth(counts, camera, depth_unit=unit)[0], tilted_depth(), atol=2e-4)
+    floats = (1000 * tilted_depth()).float()[..., None]  # millimetres, as Zivid gives them, and one channel
+    assert np.allclose(read_depth(floats, K, depth_unit=0.001)[0], tilted_depth(), atol=1e-6)
+
+
+def test_saturated_pixels_and_a_far_plane_are_not_measured():
+    mm = (1000 * tilted_depth()).numpy().astype(np.uint16)
+    mm[:20] = 65535
+    far = np.where(mm == 65535, 1e10, mm / 1000).astype(np.float32)  # a renderer's background
+    for image in (mm, far):
+        read = read_depth(image, K)[0]
+        assert not read[:20].any() and bool((read[20:] > 0).all())
+
+
+MODES = ((640, 480), (848, 480), (1280, 720), (1944, 1200), (512, 424))
+
+
+@pytest.mark.parametrize("size", MODES)
+def test_intrinsics_of_a_mode_are_refused_for_another(size):
+    k = (600.0, 602.0, 0.51 * size[0], 0.49 * size[1])
+    for width, height in MODES:
+        if (width, height) == size:
+            read_depth(np.full((height, width), 500, dtype=np.uint16), k)
+        else:
+            with pytest.raises(BadArgument, match="same resolution"):
+                read_depth(np.full((height, width), 500, dtype=np.uint16), k)
+
+
+def test_a_crop_with_its_own_principal_point_is_no_other_resolution():
+    rng, depth, refused = np.random.default_rng(0), np.full((480, 640), 500, dtype=np.uint16), 0
+    for _ in range(200):
+        (left, right), (top, bottom) = np.sort(rng.integers(0, 640, 2)), np.sort(rng.integers(0, 480, 2))
+        if min(right - left, bottom - top) < 40:
+            continue
+        part, k = depth[top:bottom, left:right], (613.0, 613.0, 322.5 - left, 248.2 - top)
+        read_depth(part, (*k, right - left, bottom - top))  # stated
+        try:
+            read_depth(part, k)
+        except BadArgument:  # as of a smaller camera, by chance
+            refused += 1
+        if max(abs(left - (640 - right)), abs(top - (480 - bottom))) > 60:  # the sensor's size, with a shifted centre
+            whole = {"fx": 613, "fy": 613, "cx": k[2], "cy": k[3], "width": 640, "height": 480}
+            if max(abs(k[2] / 640 - 0.5), abs(k[3] / 480 - 0.5)) > 0.05:
+                read_depth(part, whole)
+    assert refused < 8

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.checks import Range, Seed, checked
-from torchgrasp.cloud.depth import check_rigid, cloud_from_depth
+from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.pose import check_rigid
 from torchgrasp.cloud.sensor import SensorName, SensorNoise, add_noise, find_sensor
 from torchgrasp.errors import MeshError
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate

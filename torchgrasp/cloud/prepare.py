@@ -11,8 +11,8 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import checked
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
-from torchgrasp.cloud.depth import check_rigid
 from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics, nearest
+from torchgrasp.cloud.pose import check_rigid
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import fibonacci_sphere, unit, unit_of_any

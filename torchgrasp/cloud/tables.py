@@ -1,15 +1,20 @@
-"""Tables of numbers from strangers' files: NumPy's formats, none of which runs code, and text."""
+"""Tables of numbers from strangers' files: NumPy's formats, none of which runs code, text, images, intrinsics."""
 
 import io
+import json
 import math
 import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMNS
+from torchgrasp.errors import BadArgument
+from torchgrasp.files import is_file, read_bytes
+from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS, JSON_BYTES, LINE_LETTERS, TEXT_COLUMNS, TOML_BYTES
 
 
 def parse_npy(data: bytes) -> np.ndarray:
@@ -96,3 +101,87 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
     if not table.size:
         raise ValueError("no numbers")
     return table
+
+
+def read_image(name: str, path: Path | str) -> np.ndarray:
+    """Return the numbers of an image file: .npy, .npz with an array `depth` or `mask`, .png, .tiff or .exr.
+
+    Args:
+        name: "depth" or "mask", the name in errors and in .npz files.
+        path: the file.
+
+    Raises:
+        BadArgument: no such file, another suffix, malformed content, a picture of several channels, or no OpenEXR.
+    """
+    data, suffix = read_suffixed(name, path, (".npy", ".npz", ".png", ".tif", ".tiff", ".exr"))
+    try:
+        if suffix == ".npy":
+            return parse_npy(data)
+        if suffix == ".npz":
+            return parse_npz(data, (name,), name)[name]
+        return _read_exr(Path(path)) if suffix == ".exr" else _parse_picture(data)
+    except ModuleNotFoundError as error:
+        raise BadArgument(name, f"{path} without the package OpenEXR", "pip install OpenEXR, or a .png file") from error
+    except Exception as error:  # zlib, zipfile, numpy and Pillow each raise their own
+        raise BadArgument(name, f"{path}: {error!r}", f"a well-formed {suffix} file of one channel") from error
+
+
+def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
+    """Return the intrinsics in a .json, .yaml, .npy or .txt file, as `cloud_from_depth` takes them.
+
+    Args:
+        name: the argument in errors.
+        path: the file.
+        image: number of the image, by which BOP's scene_camera.json names its entry.
+
+    Raises:
+        BadArgument: no such file, another suffix, or malformed content.
+    """
+    data, suffix = read_suffixed(name, path, (".json", ".yaml", ".yml", ".npy", ".txt"))
+    try:
+        if suffix in (".npy", ".txt"):
+            return parse_npy(data).squeeze() if suffix == ".npy" else read_lines(data).squeeze()
+        if len(data) > (JSON_BYTES if suffix == ".json" else TOML_BYTES):
+            raise ValueError(f"{len(data)} bytes")
+        if suffix == ".json":
+            found = json.loads(data)
+        else:
+            import yaml  # a requirement of pytorch-kinematics
+
+            found = next(yaml.safe_load_all(data))
+    except Exception as error:  # YAML and JSON each raise their own
+        raise BadArgument(name, f"{path}: {error!r}", f"a well-formed {suffix} file of intrinsics") from error
+    entry = str(int(image)) if image.isdecimal() else ""
+    return found[entry] if isinstance(found, dict) and entry in found else found
+
+
+def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
+    """Return the content and the suffix of a file, or refuse it."""
+    path, allowed = Path(path), f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"
+    if not is_file(path):
+        raise BadArgument(name, f"{path}, which is no file", allowed)
+    if path.suffix.lower() not in suffixes or path.stat().st_size > CLOUD_BYTES:
+        found = f"{path} of {path.stat().st_size} bytes"
+        raise BadArgument(name, found, f"{allowed} of at most {CLOUD_BYTES} bytes")
+    return read_bytes(path), path.suffix.lower()
+
+
+def _parse_picture(data: bytes) -> np.ndarray:
+    """Return the pixels of a PNG or TIFF of one channel: uint16, uint8, bool, or float32."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=("PNG", "TIFF")) as image:
+        if image.mode not in ("1", "L", "I", "I;16", "I;16B", "F"):
+            raise ValueError(f"a picture of mode {image.mode}")
+        return np.asarray(image)
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    """Return the only channel of an OpenEXR file, or the one of depth."""
+    import OpenEXR  # pyright: ignore[reportMissingImports]
+
+    channels = OpenEXR.File(str(path)).channels()
+    depth = [name for name in channels if name.split(".")[-1] in ("Z", "V")] or list(channels)
+    if len(depth) > 1:
+        raise ValueError(f"channels {', '.join(depth)[:80]}")
+    return channels[depth[0]].pixels

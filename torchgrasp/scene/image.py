@@ -3,8 +3,8 @@
 import dataclasses
 import math
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, checked
-from torchgrasp.cloud.depth import check_rigid, frustum_of_image, read_depth
+from torchgrasp.cloud.depth import frustum_of_image, read_depth
+from torchgrasp.cloud.pose import read_camera_pose
 from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
 from torchgrasp.files import is_file, read_bytes
@@ -73,14 +74,13 @@ class DepthImage(Value):
 
 def read_image(
     depth: Tensor | np.ndarray,
-    intrinsics: Tensor | np.ndarray | Sequence[float | int],
+    intrinsics: object,
     camera_pose: Tensor | np.ndarray | None,
+    depth_unit: float | None = None,
 ) -> DepthImage:
     """Return a checked depth image in float64 [m]; a missing pose is the camera's own frame."""
-    z, k, _ = read_depth(depth, intrinsics)
-    pose = torch.eye(4, dtype=torch.float64)
-    if camera_pose is not None:
-        pose = check_rigid("camera_pose", torch.as_tensor(camera_pose).double()).cpu()
+    z, k, _ = read_depth(depth, intrinsics, depth_unit=depth_unit)
+    pose = torch.eye(4, dtype=torch.float64) if camera_pose is None else read_camera_pose(camera_pose).cpu()
     if int((z > 0).sum()) < LEAST_PIXELS:
         raise BadArgument("depth", f"{int((z > 0).sum())} measured pixels", f"at least {LEAST_PIXELS}")
     return DepthImage(z.cpu(), k.cpu(), pose)
@@ -141,22 +141,13 @@ def image_of_cloud(
     return DepthImage(depth, k, pose, bounded=False), pixels
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a scene's .npz file; the table as 4 floats, the target as a whole number.
+def read_arrays(path: Path) -> dict[str, Any]:
+    """Return the arrays of a scene's .npz file; the table as 4 floats, the target and the unit as numbers.
 
     Raises:
         CloudFileError: no such file, or malformed content.
     """
-    names = (
-        "depth",
-        "intrinsics",
-        "camera_pose",
-        "labels",
-        "mask",
-        "table",
-        "others",
-        "target",
-    )  # the first two are required
+    names = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table", "others", "target", "depth_unit")
     allowed = "a .npz file with depth and intrinsics"
     if path.suffix.lower() != ".npz" or not is_file(path):
         raise CloudFileError("path", path, allowed)
@@ -169,6 +160,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             found["table"] = found["table"].astype(float).reshape(4)
         if "others" in found:
             found["others"] = found["others"].astype(float).reshape(-1, 4)
+        if "depth_unit" in found:
+            found["depth_unit"] = found["depth_unit"].astype(float).reshape(()).item()
         if "target" in found:
             found["target"] = found["target"].astype(np.int64, casting="safe").reshape(())
     except BadArgument:

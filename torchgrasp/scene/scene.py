@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.checks import Pose, checked
+from torchgrasp.checks import Pose, Positive, checked
 from torchgrasp.cloud.depth import read_depth
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.cloud.support import find_table
@@ -54,7 +54,7 @@ class Scene(Value):
     def from_depth(
         cls,
         depth: Tensor | np.ndarray,
-        intrinsics: Tensor | np.ndarray | Sequence[float | int],
+        intrinsics: object,
         camera_pose: Tensor | np.ndarray | None = None,
         *,
         mask: Tensor | np.ndarray | None = None,
@@ -62,6 +62,7 @@ class Scene(Value):
         point: Sequence[float | int] | Tensor | np.ndarray | None = None,
         table: Plane | float | None = None,
         up: Sequence[float | int] | Tensor | np.ndarray | None = None,
+        depth_unit: Positive | None = None,
     ) -> "Scene":
         """Return the scene in a pinhole camera's depth image.
 
@@ -70,13 +71,14 @@ class Scene(Value):
 
         Args:
             depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in millimetres.
-            intrinsics: (3, 3) or (fx, fy, cx, cy) [pixels].
+            intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth` takes.
             camera_pose: obj_from_camera (4, 4), rigid; None: results are in the camera's frame.
             mask: (h, w) of bool or uint8, pixels of the target; it may be off by a few pixels.
             labels: (h, w) of whole numbers; 0 is no object.
             point: of the target: a pixel (u, v), or a point (x, y, z) [m].
             table: a plane, or its height z [m]; None: it is fitted.
             up: (3,), against gravity, for the fit; None: any direction.
+            depth_unit: metres of one count of the depth, as `cloud_from_depth` takes it.
 
         Raises:
             BadArgument: what `read_depth` refuses; mask or labels of another size; a target that is the table; a
@@ -85,8 +87,8 @@ class Scene(Value):
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")
-        image = read_image(depth, intrinsics, camera_pose)
-        inside = None if mask is None else read_depth(depth, intrinsics, mask)[2]
+        image = read_image(depth, intrinsics, camera_pose, depth_unit)
+        inside = None if mask is None else read_depth(depth, intrinsics, mask, depth_unit)[2]
         inside = None if inside is None else inside.cpu()
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points, measured = image.points(), image.depth > 0

@@ -12,8 +12,9 @@ import trimesh
 
 from torchgrasp import PointCloud, cloud_from_depth, load_hand, read_cloud, read_scene
 from torchgrasp.app.author.draft import new_hand
-from torchgrasp.cloud.depth import read_image, read_pose
+from torchgrasp.cloud.pose import read_pose
 from torchgrasp.cloud.read import save_cloud
+from torchgrasp.cloud.tables import read_image
 from torchgrasp.data import list_views, read_entries, read_entry
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign

@@ -28,10 +28,11 @@ from torchgrasp.cloud import (
     save_cloud,
     voxel_downsample,
 )
-from torchgrasp.cloud.depth import read_image, read_pose
 from torchgrasp.cloud.neighbours import draw_rows
+from torchgrasp.cloud.pose import read_pose
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.cloud.sensor import median_depth
+from torchgrasp.cloud.tables import read_image, read_intrinsics
 from torchgrasp.data import write_objects
 from torchgrasp.errors import BadArgument
 from torchgrasp.export import check_surface_path, largest_std, save_surface
@@ -120,10 +121,16 @@ class _DepthCommand(Command):
     """The arguments of commands that read a depth image."""
 
     depth: Path = positional(
-        'image along the optical axis (.png of 16 bit, .npy, or .npz with an array "depth"): integers are millimetres, '
-        "floats metres; 0 and NaN are not measured"
+        'image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, or .npz with an array "depth"): integers are '
+        "millimetres, floats metres; 0 and NaN are not measured"
     )
-    intrinsics: tuple[float, float, float, float] = required("fx fy cx cy in pixels, at the image's own resolution")
+    intrinsics: tuple[str, ...] = required(
+        "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height; or a file of ROS, "
+        "Open3D, RealSense, Zivid or BOP (.json, .yaml), or with a matrix (.npy, .txt)"
+    )
+    depth_unit: float | None = option(
+        None, "metres of one count of the depth: 0.0001 of a RealSense D405, 0.00025 of an L515, 0.001 of float mm"
+    )
     out: Path = required(OUT_CLOUD_HELP)
     mask: Path | None = option(
         None,
@@ -138,13 +145,23 @@ class _DepthCommand(Command):
     )
 
     def images(self):
-        """Return the depth image, the mask and the camera pose; None where not given."""
+        """Return the depth image, the intrinsics, the mask and the camera pose; None where not given."""
+        if self.depth_unit is not None and not 0 < self.depth_unit <= 1:
+            raise BadArgument("--depth-unit", self.depth_unit, "metres of one count, above 0 and at most 1")
+        camera = self.intrinsics
+        if len(camera) == 1:
+            camera = read_intrinsics("intrinsics", Path(camera[0]), self.depth.stem)
+        else:
+            try:
+                camera = [float(word) for word in camera]
+            except ValueError as error:
+                raise BadArgument("intrinsics", " ".join(camera), "fx fy cx cy, or a file") from error
         mask = None if self.mask is None else read_image("mask", self.mask)
         pose = None if self.camera_pose is None else read_pose("camera_pose", self.camera_pose)
         depth = read_image("depth", self.depth)
         if self.frames:
             depth = median_depth([depth, *(read_image("depth", path) for path in self.frames)])
-        return depth, mask, pose
+        return depth, camera, mask, pose
 
 
 @arguments()
@@ -153,8 +170,8 @@ class CloudDepth(_DepthCommand):
 
     def run(self) -> int:
         """Convert the depth image and write the cloud; return the exit code."""
-        depth, mask, pose = self.images()
-        cloud = cloud_from_depth(depth, self.intrinsics, mask, pose)
+        depth, camera, mask, pose = self.images()
+        cloud = cloud_from_depth(depth, camera, mask, pose, self.depth_unit)
         save_cloud(cloud, self.out)
         frame = "the camera's frame: give its vertical with --up" if pose is None else "the frame of the pose"
         print(f"{len(cloud)} points in {frame}, {self.out}")
@@ -172,8 +189,8 @@ class CloudScene(_DepthCommand):
         picture = self.out.with_suffix(".png")
         if picture.resolve() in [path.resolve() for path in (self.depth, self.mask, *self.frames) if path]:
             raise BadArgument("--out", f"{self.out}, whose picture would replace {picture}", "another name")
-        depth, mask, pose = self.images()
-        seen = Scene.from_depth(depth, self.intrinsics, pose, mask=mask)
+        depth, camera, mask, pose = self.images()
+        seen = Scene.from_depth(depth, camera, pose, mask=mask, depth_unit=self.depth_unit)
         save_scene(seen, self.out)
         draw_scene(seen, picture)
         for label in seen.things:

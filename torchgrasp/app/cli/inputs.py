@@ -17,8 +17,8 @@ from torch import Tensor
 from torchgrasp.app.cli.command import arguments, naming, option
 from torchgrasp.checks import check_tensor
 from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
-from torchgrasp.cloud.depth import read_pose
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers
+from torchgrasp.cloud.pose import read_pose
 from torchgrasp.data.shipped import DATA, list_objects
 from torchgrasp.errors import BadArgument, MissingExtra, OutputError
 from torchgrasp.files import hold_folder
