@@ -316,6 +316,18 @@ def test_scene_draws_a_picture_beside_it_that_replaces_no_input(tmp_path, capsys
         assert picture.width == 1200
 
 
+def test_a_mesh_or_a_table_that_contradicts_the_cloud_is_told_before_the_work(tmp_path, refusal, monkeypatch):
+    monkeypatch.setattr(grasps, "plan_grasps", lambda *_, **__: pytest.fail("work was done before the refusal"))
+    mesh = load_object("jug").mesh.copy()
+    mesh.apply_translation((0.13, 0.0, 0.0))
+    mesh.export(tmp_path / "moved.ply")
+    words = ["grasp", VIEW, "--out", tmp_path / "out", "--hand", "barrett"]
+    assert "--mesh: expected the cloud's points within" in refusal(*words, "--mesh", tmp_path / "moved.ply")
+    said = refusal(*words, "--table", "0.054")
+    assert "above the object's foot" in said and "--table, a table under the object's points" in said
+    assert "foot is 54 mm above the table" in refusal(*words, "--table", "-0.054", "--mesh", DATA / "jug" / "mesh.ply")
+
+
 def test_thin_leaves_one_point_a_voxel_and_no_outliers(tmp_path, capsys):
     rng = np.random.default_rng(0).normal(size=(60000, 3))
     points = np.concatenate([0.04 * rng / np.linalg.norm(rng, axis=1, keepdims=True), [[0.3, 0, 0]]])

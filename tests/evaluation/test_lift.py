@@ -13,10 +13,11 @@ from torchgrasp.closure import ClosingOptions
 from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.evaluation import GraspTrial, close_hand
-from torchgrasp.evaluation.lift import LIFT_TIME
+from torchgrasp.evaluation.lift import LIFT_TIME, lift_grasp
 from torchgrasp.evaluation.score import most_certain_first
 from torchgrasp.evaluation.trial import TrialDriver, derive_reference
 from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
@@ -202,9 +203,26 @@ def test_a_hand_that_starts_in_the_object_is_refused():
 
 
 def test_a_finger_in_the_air_is_named():
-    result = close("barrett", cylinder((0.4, 0.0)), QUICK)
+    hand, grasp = pinch("barrett")
+    result = lift_grasp(GraspTrial(hand, grasp, cylinder((0.4, 0.0))), QUICK)
     assert result.status is Status.NO_CONTACT
     assert result.contact_order == ()
+
+
+def test_a_mesh_and_a_table_that_contradict_the_grasp_are_told_before_any_work(monkeypatch):
+    hand, grasp = pinch("barrett")
+
+    def begin(*_):
+        raise InterruptedError  # the checks were passed
+
+    monkeypatch.setattr("torchgrasp.evaluation.lift.lift_grasp", begin)
+    with pytest.raises(BadArgument, match=r"mesh: expected a contact of the grasp within 30 mm .* 3 of 3 about \d+ mm"):
+        close_hand(grasp, hand, cylinder((0.0, 0.16)))
+    with pytest.raises(BadArgument, match="foot is 54 mm below the table"):
+        close_hand(grasp, hand, cylinder(), table=Plane.horizontal(0.054))
+    for shift in (0.0, 0.02):  # the estimated surface may be off
+        with pytest.raises(InterruptedError):
+            close_hand(grasp, hand, cylinder((0.0, shift)), table=Plane.horizontal(0.005))
 
 
 def test_too_little_friction_leaves_the_object_behind():

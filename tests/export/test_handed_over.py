@@ -8,8 +8,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from tests.pinch import pinch
+from tests.pinch import cylinder, pinch
 from torchgrasp.app import cli
+from torchgrasp.cloud import look_at, partial_view, save_cloud
 from torchgrasp.control.forces import squeeze
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.export import (
@@ -257,3 +258,42 @@ def test_the_commands_write_every_format_and_read_them_back(tmp_path, capsys):
     assert cli.main(["export", str(tmp_path / "back.safetensors"), "--out", str(tmp_path / "again.json")]) == 0
     first, again = (json.loads((tmp_path / f).read_text())["grasps"][0] for f in ("g.json", "again.json"))
     assert again["joints"]["grasp"] == pytest.approx(first["joints"]["grasp"])
+
+
+@pytest.fixture
+def foreign(tmp_path, capsys):
+    """Return a function that imports the pinch in MultiGripperGrasp's format with its view."""
+    hand, grasp = pinch("barrett")
+    camera = look_at(30.0, 40.0, 0.6, cylinder())
+    save_cloud(partial_view(cylinder(), camera, 300), tmp_path / "view.npz")
+    x, y, z, w = Rotation.from_matrix(grasp.obj_from_hand[0, :3, :3].numpy()).as_quat()
+    position = grasp.obj_from_hand[0, :3, 3].numpy()
+
+    def run(scale, turn, *options, shift=(0, 0, 0), view=True):
+        pose = [*(scale * (position + shift)).tolist(), *((w, x, y, z) if turn == "wxyz" else (x, y, z, w))]
+        (tmp_path / "theirs.json").write_text(json.dumps({"pose": [pose], "dofs": grasp.joints.tolist()}))
+        words = ["import", str(tmp_path / "theirs.json"), "--hand", "barrett", "--out", str(tmp_path / "t.safetensors")]
+        words += ["--joints", *hand.joint_names, *options, *(["--cloud", str(tmp_path / "view.npz")] * view)]
+        code = cli.main(words)
+        return code, "".join(capsys.readouterr()), (tmp_path / "t.safetensors").exists()
+
+    return run
+
+
+def test_poses_that_contradict_the_view_are_told_with_the_options_that_mend_them(foreign):
+    for scale, turn, mend in ((1, "xyzw", "--quaternion xyzw --unit m"), (100, "wxyz", "--quaternion wxyz --unit cm")):
+        code, words, written = foreign(scale, turn)
+        assert code == 2 and not written and f"as with {mend}" in words and "contacts within 30 mm" in words
+    code, words, written = foreign(1000, "wxyz", view=False)
+    assert code == 2 and not written and "a hand 326 m off" in words and "--unit" in words
+    code, words, written = foreign(1, "wxyz", shift=(0.2, 0, 0))  # another frame, which no option mends
+    assert code == 2 and not written and "one frame" in words and "as with" not in words
+
+
+TWINS = [(1, "wxyz", ()), (1000, "xyzw", ("--quaternion", "xyzw", "--unit", "mm"))]
+
+
+@pytest.mark.parametrize(("scale", "turn", "options"), TWINS)
+def test_poses_that_agree_with_the_view_are_taken(foreign, scale, turn, options):
+    code, words, written = foreign(scale, turn, *options)
+    assert code == 0 and written and "1 closed" in words

@@ -7,9 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import LEVEL, find_second_body, find_support
 from torchgrasp.cloud.prepare import FACING, share_facing
+from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
@@ -60,6 +62,13 @@ def judge_view(
     # An estimate may be on the wrong side of a table, but not where it is the origin of a camera's frame.
     trusted = eye is not None and facing >= FACING and (given or not bool(eye.any()))
     support = find_support(points, normals, up, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None)
+    if stands and table is not None:
+        try:
+            check_foot(cloud, table)
+        except BadArgument as error:
+            advice.append(
+                Advice(f"a table that contradicts the cloud, {error.found}", f"--table, {error.allowed}", True)
+            )
     if stands and eye is not None and facing >= FACING:
         advice += _judge_height(points, eye, given, up, table, support)
         down = float((normals @ up < -0.5).double().mean())

@@ -11,9 +11,12 @@ import torch
 
 from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.cloud.agreement import check_agreement, check_stand
+from torchgrasp.control.reference import check_single
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, smooth_step
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
@@ -69,6 +72,7 @@ def close_hand(
     Raises:
         BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint limits.
         BadArgument: an approach that is no unit vector, or an error that is no finite (4, 4).
+        BadArgument: contacts that all lie off the mesh; a table that the mesh does not stand on.
         BadArgument: the holding "law" for a closing that does not follow the law (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
@@ -80,6 +84,12 @@ def close_hand(
     >>> result.held, result.slip.distance < 0.01, result.disturbance.early, result.trace.forces.shape[1:]
     (True, True, tensor([False, False, False]), torch.Size([3, 3]))
     """
+    check_single(grasp)
+    mesh = read_mesh(mesh)
+    # Most contacts may be off, as on an uncertain surface, but not all.
+    check_agreement("mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99)
+    if table is not None:
+        check_stand(mesh, table)
     return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, parts, table, neighbours, surface), spec)
 
 

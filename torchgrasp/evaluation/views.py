@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from torchgrasp.base import Value, count_status
 from torchgrasp.checks import Count, Seed, checked
+from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.data import read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.protocols import Protocol, draw_error, seed_of
@@ -124,8 +125,10 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
     hand, score = view.load_hand(), view.score
     started = time.process_time()
     try:
-        _read_solid(view.objects, view.object)  # a bad mesh is refused before planning; its parts are cached
+        mesh, _ = _read_solid(view.objects, view.object)  # a bad mesh is refused before planning; its parts are cached
         cloud = read_view(view.objects, view.object, view.view)
+        check_mesh(cloud, mesh)
+        check_stand(mesh, Plane.horizontal(0.0))
         if planned is not None:
             return PlannedView(*_read_planned(planned, score, cloud, hand))
         started = time.process_time()

@@ -32,7 +32,7 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, Grasps
 
 MOST_GRASPS = 100_000  # most grasps of a file: more are no plan of one object
-FAR = 100.0  # largest number of a pose or posture [m, rad] in a JSON file
+FAR = 10_000.0  # largest number of a pose or posture [mm, rad] in a JSON file
 
 Quaternion = Literal["wxyz", "xyzw"]
 

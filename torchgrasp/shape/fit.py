@@ -11,6 +11,7 @@ import torch
 
 from torchgrasp.base import join
 from torchgrasp.checks import LEAST, Positive, Range, Seed, checked
+from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.neighbours import nearest
 from torchgrasp.cloud.parts import find_second_body
@@ -86,8 +87,8 @@ def fit_shape(
             greatest sum of "both", |error| + 2 sqrt(variance).
 
     Raises:
-        BadArgument: an argument out of range; a cloud that `prepare_cloud` refuses; a view that is not wholly in
-            front of its camera; for "camera" a whole surface without normals.
+        BadArgument: an argument out of range; a table above the object's foot; a cloud that `prepare_cloud` refuses; a
+            view that is not wholly in front of its camera; for "camera" a whole surface without normals.
         TooFewPoints: see `prepare_cloud`.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
@@ -116,6 +117,8 @@ class FitOptions:
 
 def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitOptions) -> ShapeGP:
     """Fit the shape in the `upright_frame` to a cloud without duplicate points; `table` is the table's height [m]."""
+    if table is not None:
+        check_foot(cloud, Plane.horizontal(table))
     generator, noise = torch.Generator().manual_seed(seed), options.noise
     seen = prepare_cloud(cloud, generator, clean=options.support == "camera")
     if options.support == "paper":

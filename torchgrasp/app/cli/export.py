@@ -1,13 +1,15 @@
 """The commands `torchgrasp export` and `torchgrasp import`: grasps in the formats of other programs."""
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
 from torchgrasp.checks import Count
 from torchgrasp.cloud import read_cloud
+from torchgrasp.cloud.agreement import check_agreement
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.export import (
     format_graspgen,
@@ -19,12 +21,15 @@ from torchgrasp.export import (
     read_foreign,
     save_dexgraspbench,
 )
+from torchgrasp.export.foreign import Quaternion
 from torchgrasp.files import write_file
+from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.problem import digest
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import load_grasps
+from torchgrasp.values import Grasps, PointCloud, load_grasps
 
+Unit = Literal["m", "cm", "mm"]
 TEXTS: dict[str, Callable[..., str]] = {
     "json": format_grasps,
     "mujoco": format_keyframes,
@@ -91,22 +96,25 @@ class Import(Command):
     out: Path = required("file to write")
     fingers: str = option("default", FINGERS_HELP)
     joints: tuple[str, ...] = option((), "names of the joints in the order of the file, where the file has no names")
-    quaternion: Literal["wxyz", "xyzw"] = option("wxyz", "order of the numbers of a rotation in the file")
-    cloud: Path | None = option(None, "the view for which the grasps are, for `torchgrasp evaluate --planned`")
+    quaternion: Quaternion = option("wxyz", "order of the numbers of a rotation in the file")
+    unit: Unit = option("m", "unit of the positions in the file")
+    cloud: Path | None = option(
+        None, "the view for which the grasps are, for `torchgrasp evaluate --planned`; the contacts must lie on it"
+    )
     friction: float = option(0.8, "coefficient of friction of the certificates")
     std: float = option(0.003, "standard deviation of the surface [m] that a closing assumes at each contact")
 
     def run(self) -> int:
         """Read the grasps of another program, certify and write them; return the exit code."""
         hand, _ = load_fingers(self.hand, self.fingers)
-        with naming(path="FILE"):
-            read = read_foreign(self.file, hand, self.joints, self.quaternion)
-        with naming(joints="FILE"):
-            spec = ContactSpec(friction=self.friction, friction_margin=1.0)
-            grasps = grasps_from_joints(hand, *read, spec, self.std)
+        grasps = self._read(hand, self.quaternion, self.unit)
         if self.cloud is not None:
             with naming(path="--cloud"):
-                grasps.meta["cloud_sha256"] = digest(read_cloud(self.cloud))
+                cloud = read_cloud(self.cloud)
+            self._check(hand, grasps, cloud)
+            grasps.meta["cloud_sha256"] = digest(cloud)
+        elif len(grasps) and (far := float(grasps.obj_from_hand[:, :3, 3].abs().max())) > 10:
+            raise BadArgument("FILE", f"a hand {far:.0f} m off", "hands within 10 m of the object's frame: --unit")
         with naming(path="--out"):
             grasps.save(self.out)
         closed = int((grasps.status == Status.OK).sum())
@@ -114,3 +122,32 @@ class Import(Command):
             f"{len(grasps)} grasps of the {hand.name} hand, {closed} closed at friction {self.friction:g}: {self.out}"
         )
         return 0 if closed else 1
+
+    def _read(self, hand: Hand, quaternion: Quaternion, unit: Unit) -> Grasps:
+        """Read the grasps and certify them."""
+        with naming(path="FILE"):
+            joints, poses, opened = read_foreign(self.file, hand, self.joints, quaternion)
+        poses[:, :3, 3] *= {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit]
+        with naming(joints="FILE"):
+            spec = ContactSpec(friction=self.friction, friction_margin=1.0)
+            return grasps_from_joints(hand, joints, poses, opened, spec, self.std)
+
+    def _check(self, hand: Hand, grasps: Grasps, cloud: PointCloud) -> None:
+        """Refuse grasps that are elsewhere than the cloud; name the options with which they are on it."""
+        error = _contradiction(grasps, cloud)
+        if error is None:
+            return
+        for unit, quaternion in itertools.product(get_args(Unit), get_args(Quaternion)):
+            if _contradiction(self._read(hand, quaternion, unit), cloud) is None:
+                mend = f"{error.allowed}, as with --quaternion {quaternion} --unit {unit}"
+                raise BadArgument("FILE", error.found, mend)
+        raise error
+
+
+def _contradiction(grasps: Grasps, cloud: PointCloud) -> BadArgument | None:
+    """Return the error of grasps that are elsewhere than the cloud."""
+    try:
+        check_agreement("FILE", grasps.contacts.points.reshape(-1, 3), "the contacts", cloud, slack=0.03, share=0.5)
+    except BadArgument as error:
+        return error
+    return None

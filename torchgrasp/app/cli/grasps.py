@@ -25,11 +25,13 @@ from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.checks import Count, Seed
+from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.data.shipped import DATA, MASSES, list_objects, load_object
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.files import format_columns, format_line, sha256
 from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.plane import as_plane
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
@@ -121,6 +123,11 @@ class Grasp(Command):
         spec, trial = make(friction=self.friction, table=table), TrialSpec(friction=self.friction)
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         print_notes(file.notes, self.view.judge(cloud, table))
+        if true_mesh is not None:
+            check_mesh(cloud, true_mesh, "--mesh")
+            plane = None if self.view.table is None else as_plane(table)
+            if plane is not None:
+                check_stand(true_mesh, plane, "--mesh")
         progress = Progress(*["fingers"] * (among is not None), *STAGES, *["closing"] * self.close, "report")
         with progress.bar, holding("--out", out):
             origin = "no table" if table is None else describe_table(table)

@@ -1,0 +1,77 @@
+"""Inputs about one object that contradict each other are told, and right twins pass."""
+
+import functools
+
+import pytest
+import torch
+import trimesh
+
+from torchgrasp.cloud.agreement import check_agreement, check_foot, check_mesh, check_stand
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.values import PointCloud
+
+BOX = trimesh.creation.box((0.08, 0.06, 0.12))
+BOX.apply_translation((0.0, 0.0, 0.06))
+GROUND = Plane.horizontal(0.0)
+
+
+@functools.cache
+def view(distance=0.6):
+    """A noisy view of the box by a camera at a distance [m]."""
+    return partial_view(BOX, look_at(30.0, 40.0, distance, BOX), 400)
+
+
+def moved(mesh, *shift):
+    copy = mesh.copy()
+    copy.apply_translation(shift)
+    return copy
+
+
+@pytest.mark.parametrize("distance", [0.4, 0.8, 1.5])
+def test_a_noisy_view_agrees_with_its_mesh_also_with_points_of_the_table(distance):
+    cloud = view(distance)
+    square = 0.1 * torch.rand(60, 3, generator=torch.Generator().manual_seed(0)).double()
+    square[:, 2] = 0.0
+    check_mesh(cloud, BOX)
+    check_mesh(PointCloud(torch.cat([cloud.points, square]), None, cloud.viewpoint), BOX)
+    check_foot(cloud, GROUND)
+    check_stand(BOX, GROUND)
+
+
+@pytest.mark.parametrize("shift", [(0.13, 0.0, 0.0), (0.0, 0.0, -0.06), (0.0, 0.04, 0.03)])
+def test_a_mesh_in_another_frame_is_told(shift):
+    with pytest.raises(BadArgument, match=r"mesh: expected the cloud's points within \d\d mm .* got \d+ of 300 about"):
+        check_mesh(view(), moved(BOX, *shift))
+    check_mesh(PointCloud(view().points + torch.tensor(shift)), moved(BOX, *shift))
+
+
+def test_the_distance_is_that_of_the_surface():
+    with pytest.raises(BadArgument, match="1 of 1 about 200 mm off"):
+        check_agreement("mesh", torch.tensor([[0.0, 0.23, 0.06]]), "points", BOX, 0.1, 0.5)
+
+
+def test_a_table_above_the_foot_is_told_and_a_hidden_foot_is_none():
+    cloud = view()
+    with pytest.raises(BadArgument, match="above the object's foot"):
+        check_foot(cloud, Plane.horizontal(0.054))
+    check_foot(cloud, Plane.horizontal(0.012))
+    check_foot(cloud, Plane.horizontal(-0.3))  # the camera may see the top alone
+    for height, word in ((0.054, "below"), (-0.054, "above")):
+        with pytest.raises(BadArgument, match=f"foot is 54 mm {word} the table"):
+            check_stand(BOX, Plane.horizontal(height))
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_contacts_on_the_hidden_side_agree_and_contacts_elsewhere_do_not(camera):
+    cloud = view() if camera else PointCloud(view().points)
+    contacts = torch.tensor([[-0.04, 0.0, 0.06], [0.04, 0.0, 0.06], [0.0, -0.03, 0.05]])
+    check_agreement("FILE", contacts, "contacts", cloud, 0.03, 0.5)
+    for wrong in (contacts + torch.tensor([0.0, 0.2, 0.0]), 100 * contacts):
+        with pytest.raises(BadArgument, match="FILE: expected contacts within 30 mm of the cloud"):
+            check_agreement("FILE", wrong, "contacts", cloud, 0.03, 0.5)
+    towards_camera = contacts + 0.15 * (view().viewpoint / view().viewpoint.norm()).float()
+    if camera:  # in space that the camera saw to be free
+        with pytest.raises(BadArgument):
+            check_agreement("FILE", towards_camera, "contacts", cloud, 0.03, 0.5)

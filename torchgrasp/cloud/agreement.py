@@ -1,0 +1,85 @@
+"""Refusals of inputs about one object that contradict each other: clouds, meshes, contacts and tables."""
+
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.neighbours import draw_rows
+from torchgrasp.cloud.plane_fit import assume_noise
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.values import PointCloud
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+def check_agreement(
+    name: str,
+    points: Float[Tensor, "n 3"],
+    what: str,
+    other: "trimesh.Trimesh | PointCloud",
+    slack: float,
+    share: float,
+) -> None:
+    """Refuse an argument if more than a share of points lie off a mesh, or off a cloud and the space it hides.
+
+    >>> from trimesh.creation import icosphere
+    >>> check_agreement("mesh", torch.eye(3), "points", icosphere(), slack=0.02, share=0.2)
+    """
+    points = points.detach().cpu().double()
+    points = points[draw_rows(len(points), 300)]
+    if isinstance(other, PointCloud):
+        distance, surface = _distance_behind(points, other), "the cloud or behind it"
+    else:
+        from trimesh.proximity import closest_point
+
+        distance, surface = torch.from_numpy(closest_point(other, points.numpy())[1]), "the mesh's surface"
+    far = distance > slack
+    if float(far.double().mean()) > share:
+        found = f"{int(far.sum())} of {len(far)} about {1e3 * float(distance[far].median()):.0f} mm off"
+        raise BadArgument(name, found, f"{what} within {1e3 * slack:.0f} mm of {surface}: one frame, in metres")
+
+
+def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
+    """Refuse a true mesh that lies elsewhere than the cloud of its object; raises `BadArgument`."""
+    check_agreement(name, cloud.points, "the cloud's points", mesh, 0.01 + 2 * _noise(cloud), 0.2)
+
+
+def check_foot(cloud: PointCloud, table: Plane) -> None:
+    """Refuse a table above the lower points of its object; raises `BadArgument`."""
+    foot = float(table.height(cloud.points.double().cpu()).quantile(0.05))
+    if -foot > 0.015 + 2 * _noise(cloud):
+        found = f"one {-1e3 * foot:.0f} mm above the object's foot"
+        raise BadArgument("table", found, f"a table under the object's points, at least {-1e3 * foot:.0f} mm lower")
+
+
+def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> None:
+    """Refuse a true mesh that does not stand on its table; raises `BadArgument`."""
+    foot = float(table.height(torch.tensor(mesh.vertices, dtype=torch.float64)).min())
+    if abs(foot) > 0.015:
+        found = f"one whose foot is {1e3 * abs(foot):.0f} mm {'above' if foot > 0 else 'below'} the table"
+        raise BadArgument(name, found, "a mesh that stands on the table, in the frame of both")
+
+
+def _noise(cloud: PointCloud) -> float:
+    """Return the noise [m] that is assumed of a depth camera."""
+    eye = None if cloud.viewpoint is None else cloud.viewpoint.double().cpu().reshape(-1, 3).mean(0)
+    return float(assume_noise(cloud.points.double().cpu(), eye).median())
+
+
+def _distance_behind(points: Float[Tensor, "n 3"], cloud: PointCloud) -> Float[Tensor, "n"]:
+    """Return the distance [m] to the rays behind a cloud, as long as the cloud; without a camera, in any direction."""
+    rows = draw_rows(len(cloud), 500)
+    seen = cloud.points[rows].double().cpu()
+    length = float(torch.linalg.vector_norm(seen.amax(0) - seen.amin(0)))
+    away = points[:, None] - seen
+    if cloud.viewpoint is None:
+        return (torch.linalg.vector_norm(away, dim=-1).amin(1) - length / 2).clamp_min(0)
+    eye = cloud.viewpoint.double().cpu()
+    ray = unit(seen - (eye if eye.ndim == 1 else eye[rows]))
+    behind = (away * ray).sum(-1, keepdim=True).clamp(0, length)
+    return torch.linalg.vector_norm(away - behind * ray, dim=-1).amin(1)
