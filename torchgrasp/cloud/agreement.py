@@ -51,7 +51,7 @@ def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -
 
 def check_foot(cloud: PointCloud, table: Plane) -> None:
     """Refuse a table above the lower points of its object; raises `BadArgument`."""
-    foot = float(table.height(cloud.points.double().cpu()).quantile(0.05))
+    foot = float(table.height(cloud.points.double().cpu()).quantile(0.02))
     if -foot > 0.015 + 2 * _noise(cloud):
         found = f"one {-1e3 * foot:.0f} mm above the object's foot"
         raise BadArgument("table", found, f"a table under the object's points, at least {-1e3 * foot:.0f} mm lower")
