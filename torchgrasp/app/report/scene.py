@@ -75,7 +75,8 @@ def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "
     if scene.table is not None:
         height = scene.table.height(points).numpy()
         kinds[measured & (height > near) & (labels == 0)] = 4
-        kinds[measured & (np.abs(height) < near)] = 2
+        for plane, kind in (*((other, 3) for other in scene.others[::-1]), (scene.table, 2)):
+            kinds[measured & (np.abs(plane.height(points).numpy()) < near)] = kind
     return kinds, labels
 
 
