@@ -165,6 +165,14 @@ class Status(enum.IntEnum):
     NEIGHBOUR_COLLISION = 29, "a link of the hand would touch a neighbour of the object, or space that may be full"
     UNREACHABLE = 30, "the arm cannot bring the hand to this pose (`reachable` refuses it)"
     BURIED = 31, "something lies on the object or leans over it"
+    # the object in its picture, before it is planned
+    FEW_PIXELS = 32, "too few pixels show the object: bring the camera nearer"
+    OFF_TABLE = 33, "the object is not over the table: give the table that it stands on"
+    CUT_OFF = 34, "the border of the image cuts off a side that fingers need: turn the camera to the object"
+    NO_DEPTH = 35, "most of the object has no depth, as glass or a mirror: coat it matt, or look from another side"
+    TOO_LOW = 36, "the object is lower than fingertips on the table need: take a hand with smaller fingertips"
+    TOO_WIDE = 37, "the object is wider than the hand spans: take a larger hand, or choose the object to plan anyway"
+    TOO_VAGUE = 38, "the shape may be off by more than half the object: add a second view, or bring the camera nearer"
     # closing
     START_OVERLAP = 40, "the hand overlaps the object or the table before closing starts"
     NO_CONTACT = 41, "a fingertip never touched the object"

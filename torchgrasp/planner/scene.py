@@ -5,16 +5,14 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from torchgrasp.base import Value
 from torchgrasp.checks import Count, Fraction, Seed, checked
-from torchgrasp.errors import BadArgument, GraspError, Status
-from torchgrasp.geometry.plane import upright_frame
+from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
 from torchgrasp.planner.explain import Funnel
+from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.problem import finger_sets
 from torchgrasp.scene.scene import Scene
@@ -29,7 +27,8 @@ from torchgrasp.values import Grasps
 class ThingPlan(Value):
     """The executable grasps of one object in a scene, best first, or the reason why there are none.
 
-    `success` is predicted for the best grasp; without grasps it is 0. `shape` is the estimated shape.
+    `success` is predicted for the best grasp; without grasps it is 0. `shape` is the estimated shape. `status` names
+    what the picture shows against the object; then nothing was planned.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
@@ -42,6 +41,7 @@ class ThingPlan(Value):
     grasps: Grasps | None = None
     reason: str = ""
     shape: ShapeGP | None = None
+    status: Status = Status.OK
 
 
 @checked
@@ -77,7 +77,8 @@ def plan_scene(
 ) -> ScenePlan:
     """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
-    Tall objects with free space around them are planned first.
+    Objects that the hand cannot grasp by what the picture shows are not planned (`Status.FEW_PIXELS` to `TOO_VAGUE`).
+    Of the others, near and tall objects with free space around them are planned first.
 
     Args:
         scene: objects on a table.
@@ -104,7 +105,11 @@ def plan_scene(
         plan_grasps, hand=hand, spec=spec, starts=starts, seed=seed, fingers=fingers, reachable=reachable
     )
     plans: list[ThingPlan] = []
+    judged = judge_things(scene, hand, spec)
     for label in order_by_ease(scene):
+        if judged[label] is not Status.OK:
+            plans.append(ThingPlan(label, 0.0, reason=judged[label].sentence, status=judged[label]))
+            continue
         if any(thing.success >= enough for thing in plans):
             plans.append(ThingPlan(label, 0.0, reason="not tried: another object is easy enough"))
             continue
@@ -119,36 +124,16 @@ def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
 
     def note(stage: str, message: str, value: object) -> None:
         stages[stage] = value
+        if stage == "shape" and is_vague(value):
+            stages["vague"] = Status.TOO_VAGUE
+            raise FailedRows(Status.TOO_VAGUE.sentence)
 
     try:
         grasps = plan(scene, observer=note)
     except GraspError as error:
-        return ThingPlan(scene.target, 0.0, reason=str(error))
+        return ThingPlan(scene.target, 0.0, reason=str(error), status=stages.get("vague", Status.OK))
     good = grasps[grasps.status == Status.OK]
     if len(good):
         return ThingPlan(scene.target, float(good.success[0]), good, shape=stages["shape"])
     funnel = Funnel.of(stages["plan"], stages["certify"], stages["query"], grasps)
     return ThingPlan(scene.target, 0.0, reason=funnel.reason.sentence)
-
-
-def order_by_ease(scene: Scene) -> list[int]:
-    """Return the labels of a scene's objects, the easiest first.
-
-    An object is easy if it is tall, has free space around it, and has nothing above it.
-    """
-    from scipy.spatial import KDTree
-
-    room, height, side = 0.06, 0.08, 0.01  # [m] more room or height makes nothing easier; side of a column of points
-    upright = scene.to_upright(upright_frame(scene.points, scene.viewpoint, scene.table))
-    points, labels, ease = upright.points.cpu().numpy(), upright.labels.cpu().numpy(), {}
-    column = np.unique(np.floor(points[:, :2] / side), axis=0, return_inverse=True)[1].reshape(-1)
-    for label in scene.things:
-        own, others = points[labels == label], (labels > 0) & (labels != label)
-        gap = KDTree(points[others]).query(own)[0].min() if others.any() else room
-        top = np.full(column.max() + 1, np.inf)
-        np.minimum.at(top, column[labels == label], own[:, 2])
-        above = np.unique(column[others & (points[:, 2] > top[column] + side)])
-        covered = len(above) / len(np.unique(column[labels == label]))
-        own_height = np.quantile(own[:, 2], 0.95) if scene.table is not None else height
-        ease[label] = min(gap / room, 1.0) + min(own_height / height, 1.0) - min(5.0 * covered, 1.0)
-    return sorted(ease, key=lambda label: -ease[label])

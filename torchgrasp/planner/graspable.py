@@ -1,0 +1,142 @@
+"""Whether a hand can grasp an object of a scene, and how easy it is: by picture and hand, before anything is planned."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.checks import checked
+from torchgrasp.errors import Status
+from torchgrasp.geometry.plane import to_upright, upright_frame
+from torchgrasp.hand.hand import Hand
+from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
+
+LEAST_PIXELS = 100  # fewer pixels are a speck of noise, or too coarse for a shape
+
+
+@checked
+def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> dict[int, Status]:
+    """Return for each object the first reason why the hand cannot grasp it, or `Status.OK`; it takes milliseconds.
+
+    Args:
+        scene: objects on a table.
+        hand: from `load_hand`.
+        spec: the constraints on contacts; None: `ContactSpec()`.
+
+    >>> from torchgrasp import load_hand, load_scene
+    >>> set(judge_things(load_scene(), load_hand("barrett")).values()) == {Status.OK}
+    True
+    """
+    if not scene.things:
+        return {}
+    spec = (ContactSpec() if spec is None else spec).for_fingertips(float(hand.tips.radius.max()))
+    span = hand_span(hand)
+    points, labels = _stand_upright(scene)
+    return {label: _judge(scene, points[labels == label], label, spec, span) for label in scene.things}
+
+
+def _judge(scene: Scene, points: Float[Tensor, "n 3"], label: int, spec: ContactSpec, span: float) -> Status:
+    """Return the first reason against an object with points in the upright frame."""
+    pixels, bounded = scene.pixels[scene.labels == label], scene.image.bounded
+    if len(pixels) < LEAST_PIXELS:
+        return Status.FEW_PIXELS
+    if bounded and _is_cut(pixels, scene.image.depth.shape):
+        return Status.CUT_OFF
+    if bounded and _is_see_through(pixels, scene.image.depth):
+        return Status.NO_DEPTH
+    top = float(points[:, 2].quantile(0.98))
+    if scene.table is not None and top < spec.least_height:
+        return Status.TOO_LOW
+    above = points[points[:, 2] > top - 2 * spec.fingertip_radius, :2]
+    return Status.TOO_WIDE if _thickness(above, spec.fingertip_radius / 2) > span else Status.OK
+
+
+def _stand_upright(scene: Scene) -> tuple[Float[Tensor, "n 3"], Int[Tensor, "n"]]:
+    """Return the points of all objects in the upright frame [m], and their labels."""
+    points, labels = (x[scene.labels > 0].cpu() for x in (scene.points, scene.labels))
+    return to_upright(points, upright_frame(points, scene.viewpoint, scene.table)), labels
+
+
+def _is_cut(pixels: Tensor, shape: tuple[int, ...]) -> bool:
+    """Return whether a border of the image cuts an object where it is wider than the object reaches into the image."""
+    for axis in (0, 1):
+        for depth in (pixels[:, axis], shape[axis] - 1 - pixels[:, axis]):
+            along = pixels[depth <= 1, 1 - axis]
+            if len(along) >= 5 and int(along.max() - along.min()) > int(depth.max()):  # fewer pixels are noise
+                return True
+    return False
+
+
+def _is_see_through(pixels: Tensor, depth: Float[Tensor, "h w"]) -> bool:
+    """Return whether more pixels between those of an object lack depth than the object has pixels."""
+    low, high = pixels.amin(0).tolist(), pixels.amax(0).tolist()
+    box = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
+    own = np.zeros(depth.shape, dtype=bool)
+    own[tuple(pixels.T.numpy())] = True
+    within = ~own[box]
+    for axis in (0, 1):
+        for turn in (slice(None), slice(None, None, -1)):
+            way = (turn, slice(None)) if axis == 0 else (slice(None), turn)
+            within &= np.logical_or.accumulate(own[box][way], axis)[way]
+    return int((within & (depth[box].numpy() == 0)).sum()) > len(pixels)
+
+
+def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:
+    """Return the diameter [m] of the largest disc that points fill, in cells of this side [m]."""
+    from scipy.ndimage import binary_closing, distance_transform_edt
+
+    place = torch.floor((points - points.amin(0)) / cell).long().numpy() + 2
+    filled = np.zeros(place.max(0) + 3, dtype=bool)
+    filled[tuple(place.T)] = True
+    inside = np.asarray(distance_transform_edt(binary_closing(filled, np.ones((3, 3)))))
+    return (2 * float(inside.max()) - 1) * cell
+
+
+def hand_span(hand: Hand) -> float:
+    """Return the largest distance [m] between two pads that face each other within their cones, over random joints."""
+    if "span" not in hand.derived:
+        draw = torch.rand(5000, hand.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        pads, normals = hand.fingertips(hand.lower + draw.to(hand.lower) * (hand.upper - hand.lower))
+        way = pads[:, None] - pads[:, :, None]
+        distance = torch.linalg.vector_norm(way, dim=-1)
+        cosine = (normals[:, :, None] * way).sum(-1) / distance.clamp_min(1e-9)
+        facing = cosine >= hand.tips.cone.cos()[:, None]
+        hand.derived["span"] = float(torch.where(facing & facing.transpose(1, 2), distance, 0.0).max())
+    return hand.derived["span"]
+
+
+def is_vague(shape: ShapeGP) -> bool:
+    """Return whether the deviation somewhere on the surface exceeds half the size of the object."""
+    return float(extract_surface(shape, 24).std_m.quantile(0.99)) > shape.scale
+
+
+def order_by_ease(scene: Scene) -> list[int]:
+    """Return the labels of a scene's objects, the easiest first.
+
+    An object is easy if it is tall, has free space around it, and has nothing above it; and if the camera is so near
+    that its pixels are smaller than a contact, and sees more of it than fingertips cover.
+    """
+    from scipy.spatial import KDTree
+
+    room, height, side = 0.06, 0.08, 0.01  # [m] more room or height makes nothing easier; side of a column of points
+    points, labels, ease = *(x.numpy() for x in _stand_upright(scene)), {}
+    column = np.unique(np.floor(points[:, :2] / side), axis=0, return_inverse=True)[1].reshape(-1)
+    for label in scene.things:
+        own, others = points[labels == label], labels != label
+        gap = KDTree(points[others]).query(own)[0].min() if others.any() else room
+        top = np.full(column.max() + 1, np.inf)
+        np.minimum.at(top, column[labels == label], own[:, 2])
+        above = np.unique(column[others & (points[:, 2] > top[column] + side)])
+        covered = len(above) / len(np.unique(column[labels == label]))
+        own_height = np.quantile(own[:, 2], 0.95) if scene.table is not None else height
+        pixel = float(scene.image.depth[tuple(scene.pixels[scene.labels == label].T)].median())
+        pixel /= float(scene.image.intrinsics[0, 0])
+        seen = len(own) * pixel**2 / (3 * math.pi * TIP_RADIUS**2)
+        clear = min(FLAT_RADII[0] / pixel, 1.0) + min(seen, 1.0)
+        ease[label] = min(gap / room, 1.0) + min(own_height / height, 1.0) - min(5.0 * covered, 1.0) + clear
+    return sorted(ease, key=lambda label: -ease[label])
