@@ -10,8 +10,8 @@ from torchgrasp import ContactSpec, Status, load_hand, load_scene, plan_grasps, 
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.planner.problem import TARGET_POINTS, take_target
 from torchgrasp.planner.graspable import order_by_ease
+from torchgrasp.planner.problem import TARGET_POINTS, take_target
 
 HAND = load_hand("barrett")
 

@@ -8,10 +8,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.checks import checked
+from torchgrasp.cloud.support import find_table
 from torchgrasp.errors import Status
 from torchgrasp.geometry.plane import to_upright, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
+from torchgrasp.scene.segment import OVERHANG
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
@@ -37,7 +39,13 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
     spec = (ContactSpec() if spec is None else spec).for_fingertips(float(hand.tips.radius.max()))
     span = hand_span(hand)
     points, labels = _stand_upright(scene)
-    return {label: _judge(scene, points[labels == label], label, spec, span) for label in scene.things}
+    found = {label: _judge(scene, points[labels == label], label, spec, span) for label in scene.things}
+    if scene.table is not None:
+        support = find_table(scene.points, scene.viewpoint, scene.table, None)[0]
+        over = support.covers(scene.points[scene.labels > 0].cpu().double(), OVERHANG)
+        off = {label: Status.OFF_TABLE for label in found if not bool(over[labels == label].double().mean() > 0.5)}
+        found |= {label: status for label, status in off.items() if found[label] is not Status.FEW_PIXELS}
+    return found
 
 
 def _judge(scene: Scene, points: Float[Tensor, "n 3"], label: int, spec: ContactSpec, span: float) -> Status:
@@ -74,16 +82,11 @@ def _is_cut(pixels: Tensor, shape: tuple[int, ...]) -> bool:
 
 def _is_see_through(pixels: Tensor, depth: Float[Tensor, "h w"]) -> bool:
     """Return whether more pixels between those of an object lack depth than the object has pixels."""
-    low, high = pixels.amin(0).tolist(), pixels.amax(0).tolist()
-    box = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
-    own = np.zeros(depth.shape, dtype=bool)
+    own, box = np.zeros(depth.shape, dtype=bool), tuple(slice(int(x.min()), int(x.max()) + 1) for x in pixels.T)
     own[tuple(pixels.T.numpy())] = True
-    within = ~own[box]
-    for axis in (0, 1):
-        for turn in (slice(None), slice(None, None, -1)):
-            way = (turn, slice(None)) if axis == 0 else (slice(None), turn)
-            within &= np.logical_or.accumulate(own[box][way], axis)[way]
-    return int((within & (depth[box].numpy() == 0)).sum()) > len(pixels)
+    part, reach = own[box], np.logical_or.accumulate
+    down, right = reach(part, 0) & reach(part[::-1], 0)[::-1], reach(part, 1) & reach(part[:, ::-1], 1)[:, ::-1]
+    return int(((down | right) & (depth[box].numpy() == 0)).sum()) > len(pixels)
 
 
 def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:
@@ -128,7 +131,7 @@ def order_by_ease(scene: Scene) -> list[int]:
     column = np.unique(np.floor(points[:, :2] / side), axis=0, return_inverse=True)[1].reshape(-1)
     for label in scene.things:
         own, others = points[labels == label], labels != label
-        gap = KDTree(points[others]).query(own)[0].min() if others.any() else room
+        gap = KDTree(points[others]).query(own, distance_upper_bound=room)[0].min() if others.any() else room
         top = np.full(column.max() + 1, np.inf)
         np.minimum.at(top, column[labels == label], own[:, 2])
         above = np.unique(column[others & (points[:, 2] > top[column] + side)])

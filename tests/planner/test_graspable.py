@@ -1,0 +1,98 @@
+"""What the picture of a scene and the hand say against an object, before it is planned."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.make import half_ball, see
+from torchgrasp import Status, load_hand, plan_scene
+from torchgrasp.cloud.camera import INTRINSICS
+from torchgrasp.planner.graspable import hand_span, is_vague, judge_things, order_by_ease
+from torchgrasp.scene import Scene
+
+HAND = load_hand("allegro")
+BOX = (0.0, 0.0, 0.06, 0.1)
+
+
+def without(scene: Scene, rows: torch.Tensor) -> Scene:
+    """Return the scene without the depth of some of its points."""
+    depth, labels = scene.image.depth.clone(), torch.zeros(scene.image.depth.shape, dtype=torch.int64)
+    depth[tuple(scene.pixels[rows].T)] = 0.0
+    labels[tuple(scene.pixels.T)] = scene.labels
+    return Scene.from_depth(depth, INTRINSICS, scene.image.obj_from_camera, labels=labels, table=scene.table)
+
+
+def glass() -> Scene:
+    """Return the scene of a box of which a stripe in five has a depth."""
+    scene = see(BOX)
+    return without(scene, (scene.labels == 1) & (scene.pixels[:, 1] % 20 > 3))
+
+
+def beside_table() -> Scene:
+    """Return the scene of two boxes; the table is seen around the second one only."""
+    scene = see((-0.2, 0.3, 0.06, 0.1), BOX)
+    return without(scene, (scene.labels == 0) & (scene.points[:, :2].norm(dim=1) > 0.2))
+
+
+def speck() -> Scene:
+    """Return the scene of a box of which sixty points are known."""
+    scene = see(BOX)
+    return dataclasses.replace(scene, labels=scene.labels * (scene.labels.cumsum(0) <= 60))
+
+
+SCENES = {
+    Status.OK: lambda: see(BOX),
+    Status.FEW_PIXELS: speck,
+    Status.OFF_TABLE: beside_table,
+    Status.CUT_OFF: lambda: see((-0.123, 0.338, 0.06, 0.1), BOX),
+    Status.NO_DEPTH: glass,
+    Status.TOO_LOW: lambda: see((0.0, 0.0, 0.1, 0.008)),
+    Status.TOO_WIDE: lambda: see((0.0, 0.0, 0.32, 0.1)),
+}
+
+
+@pytest.mark.parametrize("status", SCENES)
+def test_an_object_is_judged_by_its_picture(status):
+    assert judge_things(SCENES[status](), HAND)[1] is status
+
+
+def test_only_the_object_beside_the_table_is_refused():
+    assert judge_things(beside_table(), HAND)[2] is Status.OK
+
+
+def test_a_border_that_cuts_off_a_foot_refuses_nothing():
+    scene = see((0.262, 0.095, 0.03, 0.12), (-0.1, 0.0, 0.06, 0.1))
+    assert int(scene.pixels[scene.labels == 1, 0].max()) == scene.image.depth.shape[0] - 1
+    assert judge_things(scene, HAND)[1] is Status.OK
+
+
+def test_a_hand_spans_what_its_pads_enclose():
+    spans = {name: hand_span(load_hand(name)) for name in ("shadow", "allegro", "barrett")}
+    assert list(spans) == sorted(spans, key=spans.__getitem__)
+    assert all(0.1 < span < 0.4 for span in spans.values())
+
+
+def test_a_shape_that_may_be_anything_is_vague():
+    assert not is_vague(half_ball(-0.5, 1.0)) and is_vague(half_ball(0.8, 500.0))
+
+
+def test_refused_objects_are_not_planned(monkeypatch):
+    scene, planned = see((0.2, 0.0, 0.1, 0.008), BOX, (-0.15, 0.1, 0.1, 0.009)), []
+    monkeypatch.setattr("torchgrasp.planner.scene._plan_thing", lambda scene, plan: planned.append(scene.target))
+    with pytest.raises(AttributeError):  # of the result of None
+        plan_scene(scene, HAND, starts=10)
+    assert planned == [2]
+
+
+def test_a_vague_shape_ends_the_planning_with_its_status(monkeypatch):
+    monkeypatch.setattr("torchgrasp.planner.scene.is_vague", lambda shape: True)
+    (thing,) = plan_scene(see(BOX), HAND, starts=10).things
+    assert thing.status is Status.TOO_VAGUE and thing.reason == thing.status.sentence and thing.grasps is None
+
+
+def test_a_distant_object_is_less_easy():
+    near, far = see((0.1, 0.0, 0.06, 0.1), (-0.15, 0.0, 0.06, 0.1)), None
+    coarse = dataclasses.replace(near.image, intrinsics=near.image.intrinsics / 40)
+    far = dataclasses.replace(near, image=coarse)
+    assert order_by_ease(near) in ([1, 2], [2, 1]) and order_by_ease(far) == order_by_ease(near)
