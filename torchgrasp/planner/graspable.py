@@ -1,4 +1,4 @@
-"""Whether a hand can grasp an object of a scene, and how easy it is: by picture and hand, before anything is planned."""
+"""Whether a hand can grasp an object of a scene, and how easily, judged by its picture before it is planned."""
 
 import math
 
