@@ -316,6 +316,22 @@ def test_scene_draws_a_picture_beside_it_that_replaces_no_input(tmp_path, capsys
         assert picture.width == 1200
 
 
+def test_scene_takes_the_table_the_vertical_and_a_pixel_of_the_target(tmp_path, capsys):
+    depth = np.full((120, 160), 0.8)
+    depth[40:80, 60:100] = 0.7
+    np.save(tmp_path / "depth.npy", depth)
+    words = ["cloud", "scene", str(tmp_path / "depth.npy"), "--intrinsics", "140", "140", "79.5", "59.5", "--out"]
+    words.append(str(tmp_path / "scene.npz"))
+    for options in (["--table", "0", "0", "-2", "-1.6"], ["--up", "0", "0.1", "-1", "--point", "80", "60"]):
+        assert cli.main([*words, *options]) == 0
+        seen = read_scene(tmp_path / "scene.npz")
+        assert seen.table is not None and abs(seen.table.offset + 0.8) < 0.001
+        assert seen.target == (1 if "--point" in options else None)
+    for bad in (["--table", "0", "1"], ["--table", "0", "0", "0", "1"], ["--up", "0", "0", "0"], ["--point", "5", "5"]):
+        capsys.readouterr()
+        assert cli.main([*words, *bad]) == 2 and capsys.readouterr().err.startswith(f"torchgrasp: {bad[0]}: expected ")
+
+
 def test_a_mesh_or_a_table_that_contradicts_the_cloud_is_told_before_the_work(tmp_path, refusal, monkeypatch):
     monkeypatch.setattr(grasps, "plan_grasps", lambda *_, **__: pytest.fail("work was done before the refusal"))
     mesh = load_object("jug").mesh.copy()

@@ -14,6 +14,7 @@ from torchgrasp.app.cli.inputs import (
     ViewOptions,
     find_cloud,
     print_notes,
+    read_table,
 )
 from torchgrasp.app.report.scene import draw_scene
 from torchgrasp.checks import Range, Seed, check_tensor
@@ -180,9 +181,17 @@ class CloudDepth(_DepthCommand):
 
 @arguments()
 class CloudScene(_DepthCommand):
-    """Write the scene of a depth image for `torchgrasp grasp`: the table and the objects on it; and its picture."""
+    """Write the scene of a depth image for `torchgrasp grasp`: the table and the objects on it; and its picture.
+
+    See docs/real_camera.md.
+    """
 
     out: Path = required("scene to write (.npz); beside it a .png shows the table, objects and obstacles")
+    table: tuple[float, ...] | None = option(
+        None, "height z of the table, or four numbers nx ny nz d of the plane n . p = d [m]; by default it is found"
+    )
+    up: tuple[float, float, float] | None = option(None, "roughly against gravity, in the frame of the results")
+    point: tuple[float, float] | None = option(None, "column and row of a pixel on the target")
 
     def run(self) -> int:
         """Find the table and the objects, write the scene and its picture; return the exit code."""
@@ -190,7 +199,11 @@ class CloudScene(_DepthCommand):
         if picture.resolve() in [path.resolve() for path in (self.depth, self.mask, *self.frames) if path]:
             raise BadArgument("--out", f"{self.out}, whose picture would replace {picture}", "another name")
         depth, camera, mask, pose = self.images()
-        seen = Scene.from_depth(depth, camera, pose, mask=mask, depth_unit=self.depth_unit)
+        if self.up is not None and not any(self.up):
+            raise BadArgument("--up", "a vector of length zero", "the direction that points up")
+        table = None if self.table is None else read_table(self.table)
+        given = {"mask": mask, "point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit}
+        seen = Scene.from_depth(depth, camera, pose, **given)
         save_scene(seen, self.out)
         draw_scene(seen, picture)
         for label in seen.things:

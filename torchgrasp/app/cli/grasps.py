@@ -61,8 +61,8 @@ class Grasp(Command):
     """
 
     cloud: Path = positional(
-        f"{CLOUD_HELP}, a scene (.npz with depth and intrinsics; see docs/scenes.md), or the name of a shipped object, "
-        "as jug"
+        f"{CLOUD_HELP}, a scene (.npz with depth and intrinsics; see docs/real_camera.md), or the name of a shipped "
+        "object, as jug"
     )
     hand: str = option("allegro", HAND_HELP)
     out: Path | None = option(None, "folder of the results; by default out/ and the name of the object")

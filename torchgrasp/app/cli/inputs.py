@@ -106,23 +106,13 @@ class CloudOptions(ViewOptions):
             raise BadArgument("--table", f"{' '.join(f'{x:g}' for x in table)} and --no-table", "one of the two")
         if self.no_table:
             return None
-        if table is not None and len(table) not in (1, 4):
-            raise BadArgument("--table", f"{len(table)} numbers", "a height, or four: a normal and its distance")
-        numbers = (
-            None if table is None else check_tensor("--table", torch.tensor(table, dtype=torch.float64), (len(table),))
-        )
-        if numbers is not None and len(numbers) == 4:
-            length = torch.linalg.vector_norm(numbers[:3])
-            if not bool(length > 0):
-                raise BadArgument("--table", "a normal of length zero", "the direction that points up")
-            return Plane(numbers[:3] / length, float(numbers[3] / length))
-        up = self.vertical
-        if numbers is None:
+        up, given = self.vertical, None if table is None else read_table(table)
+        if isinstance(given, Plane):
+            return given
+        if given is None:
             seen = cloud.points[find_inliers(cloud.points.double())]
-            height = float((seen[:, 2] if up is None else seen.double() @ up).min())
-        else:
-            height = float(numbers[0])
-        return height if up is None else Plane(up, height)
+            given = float((seen[:, 2] if up is None else seen.double() @ up).min())
+        return given if up is None else Plane(up, given)
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
         """Return advice on the quality of a cloud; raise `BadArgument` if no grasp should be planned on it."""
@@ -134,6 +124,19 @@ class CloudOptions(ViewOptions):
             if bad.refused:
                 raise BadArgument("CLOUD", bad.found, bad.fix)
         return advice
+
+
+def read_table(table: tuple[float, ...]) -> Plane | float:
+    """Return the plane of --table, or its height [m]."""
+    if len(table) not in (1, 4):
+        raise BadArgument("--table", f"{len(table)} numbers", "a height, or four: a normal and its distance")
+    numbers = check_tensor("--table", torch.tensor(table, dtype=torch.float64), (len(table),))
+    if len(numbers) == 1:
+        return float(numbers[0])
+    length = torch.linalg.vector_norm(numbers[:3])
+    if not bool(length > 0):
+        raise BadArgument("--table", "a normal of length zero", "the direction that points up")
+    return Plane(numbers[:3] / length, float(numbers[3] / length))
 
 
 def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
