@@ -1,5 +1,7 @@
 """The pose of a depth camera: read, rigid, and not contradicted by what the camera sees."""
 
+import contextlib
+import math
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import RIGID, check_tensor, is_rigid
+from torchgrasp.cloud.support import Support, find_table
 from torchgrasp.cloud.tables import parse_npy, read_lines, read_suffixed
-from torchgrasp.errors import BadArgument
+from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.plane import Plane
+
+UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count is"
 
 
 def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
@@ -42,9 +49,10 @@ def _describe_fault(pose: Float[Tensor, "4 4"]) -> str:
 def read_camera_pose(pose: Tensor | np.ndarray) -> Float[Tensor, "4 4"]:
     """Return the pose of a camera in float64; refuse a pose that is not rigid or of another unit."""
     try:
-        read = check_rigid("camera_pose", torch.as_tensor(pose).double())
+        read = torch.as_tensor(pose).double()
     except (TypeError, ValueError) as error:
         raise BadArgument("camera_pose", repr(pose)[:80], "a 4 x 4 matrix of numbers") from error
+    read = check_rigid("camera_pose", read)
     check_distance(read, float(torch.linalg.vector_norm(read[:3, 3])), 100.0, "the camera")
     return read
 
@@ -70,3 +78,90 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
     except Exception as error:
         raise BadArgument(name, f"{path}: {error!r}", f"a well-formed {suffix} file of 4 x 4 numbers") from error
     return check_rigid(name, pose)
+
+
+def find_plausible(
+    points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], table: Plane | float | None, up: object, known_unit: bool
+) -> tuple[Support, ...]:
+    """Return the supports that `find_table` finds; refuse a pose or a unit that the view contradicts.
+
+    Args:
+        points: everything that the camera saw [m].
+        pose: of the camera; the identity, nearly, is the camera's own frame, where any direction may be up.
+        table: a plane, or its height z [m]; None: it is found.
+        up: (3,), against gravity; None: z.
+        known_unit: whether the user stated the unit of the depth.
+    """
+    eye = pose[:3, 3]
+    own = float(torch.diagonal(pose[:3, :3]).min()) > 0.985 and float(torch.linalg.vector_norm(eye)) < 0.1
+    try:
+        supports = find_table(points, eye, table, up)
+    except NoSupport:
+        middle = float(((points - eye) @ pose[:3, 2]).median())
+        if table is None and not known_unit and not 0.15 < middle < 4.0:
+            found = f"a median depth of {middle:.3g} m, and no table"
+            raise BadArgument("depth", found, UNIT) from None
+        if up is not None and table is None and not own:
+            with contextlib.suppress(NoSupport):
+                _check_normals(find_table(points, eye, None, None), pose, up)
+        raise
+    plane = supports[0].plane
+    if table is not None:
+        _check_given_table(points, plane)
+        return supports
+    if not own:
+        _check_normals(supports, pose, up)
+        check_distance(pose, plane.offset, 10.0, "a table")
+    if float(plane.height(eye)) > (10.0 if known_unit else 4.0):
+        found = f"a camera {float(plane.height(eye)):.3g} m above the table"
+        raise BadArgument("depth", found, UNIT)
+    return supports
+
+
+def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up: object) -> None:
+    """Refuse a pose that turns the table over, or one that another convention would make upright."""
+    sky = torch.tensor([0.0, 0.0, 1.0]).double() if up is None else unit(torch.as_tensor(up).double().cpu())
+    normals = torch.stack([support.plane.normal.double() for support in supports])
+    if float((normals @ sky).max()) > math.cos(math.radians(15.0)):
+        return
+    turn, flip = pose[:3, :3], torch.diag(torch.tensor([1.0, -1.0, -1.0]).double())
+    optical = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).double()
+    mirror, upset = (torch.diag(torch.tensor(signs).double()) for signs in ([-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]))
+    meant = {
+        "camera_pose @ diag(1, -1, -1, 1), if it is OpenGL's (y up, z backward)": turn @ flip,
+        "the inverse of camera_pose, if it is camera_from_world": turn.T,
+        "inv(camera_pose) @ diag(1, -1, -1, 1), if it is OpenGL's view matrix": turn.T @ flip,
+        "the pose of the optical frame, if it is of ROS's camera_link (x forward, z up)": turn @ optical,
+        "depth[::-1], if the image is upside down": turn @ upset,
+        "depth[:, ::-1], if the image is mirrored": turn @ mirror,
+    }
+    seen = turn.T @ normals[0]
+    fixes = [fix for fix, world in meant.items() if float(world @ seen @ sky) > math.cos(math.radians(5.0))]
+    cosine = float(normals[0] @ sky)
+    if not fixes and cosine > -math.cos(math.radians(15.0)):
+        return  # a frame that is tilted
+    angle, other = math.degrees(math.acos(max(-1.0, cosine))), "z" if up is None else "this `up`"
+    normal = ", ".join(f"{x:.2f}" for x in normals[0].tolist())
+    allowed = (
+        f"a pose in which the table's normal points up: {' or '.join([*fixes[:3], f'`up`, if {other} is not up'])}"
+    )
+    raise BadArgument("camera_pose", f"a table whose normal ({normal}) is {angle:.0f} degrees from up", allowed)
+
+
+def _check_given_table(points: Float[Tensor, "n 3"], plane: Plane) -> None:
+    """Refuse a table that the camera did not see, below or far above all points."""
+    height = plane.height(points[:: 1 + len(points) // 20_000].double())
+    low, middle = float(torch.quantile(height, 0.01)), float(height.median())
+    if float((height.abs() < 0.03).double().mean()) < 0.001 and (middle < 0 or low > 0.5):
+        found = f"one that no point is near: they are {middle:.3g} m above it, in the middle"
+        raise BadArgument("table", found, "the table in the frame of a camera_pose in metres, whose z looks forward")
+
+
+def check_sizes(points: Float[Tensor, "n 3"], labels: Tensor, eye: Float[Tensor, "3"], plane: Plane) -> None:
+    """Refuse depth in another unit: every object is far larger, or smaller, than a hand can grasp."""
+    parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
+    sizes = [float((part.amax(0) - part.amin(0)).max()) for part in parts if len(part) >= 100]
+    height = float(plane.height(eye))
+    if sizes and ((min(sizes) > 0.5 and height > 1.0) or (max(sizes) < 0.03 and height < 0.12)):
+        found = f"a camera {height:.3g} m above the table and objects of {min(sizes):.2g} to {max(sizes):.2g} m"
+        raise BadArgument("depth", found, UNIT)

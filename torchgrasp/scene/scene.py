@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, Positive, checked
 from torchgrasp.cloud.depth import read_depth
+from torchgrasp.cloud.pose import check_sizes, find_plausible
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.cloud.support import find_table
 from torchgrasp.errors import BadArgument
@@ -82,7 +83,7 @@ class Scene(Value):
 
         Raises:
             BadArgument: what `read_depth` refuses; mask or labels of another size; a target that is the table; a
-                point where nothing was measured; a camera below the table.
+                point where nothing was measured; a camera below the table; a pose or a unit that the view contradicts.
             NoSupport: no plane that objects stand on.
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
@@ -92,8 +93,10 @@ class Scene(Value):
         inside = None if inside is None else inside.cpu()
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points, measured = image.points(), image.depth > 0
-        supports = find_table(points[measured], image.obj_from_camera[:3, 3], table, up)
+        supports = find_plausible(points[measured], image.obj_from_camera, table, up, depth_unit is not None)
         found = label_image(image, supports[0], given, inside)
+        if table is None and depth_unit is None:
+            check_sizes(points[measured], found[measured], image.obj_from_camera[:3, 3], supports[0].plane)
         target = None if mask is None else 1
         planes = tuple(support.plane for support in supports)
         scene = cls(points[measured], found[measured], image, torch.nonzero(measured), planes[0], target, planes[1:])

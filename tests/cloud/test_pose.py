@@ -1,0 +1,127 @@
+"""Wrong inputs of a camera, each told in a sentence that names the repair; its right twin passes."""
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.make import box
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
+from torchgrasp.scene import Scene, read_scene, save_scene
+
+GL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
+OPTICAL = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).double()  # link_from_optical
+VIEWS = {"front": (20.0, 45.0), "low": (140.0, 28.0), "steep": (-70.0, 68.0)}
+
+
+@functools.cache
+def seen(view="front"):
+    """Depth [m] of two boxes on a table, and the camera's pose."""
+    pose = look_at(*VIEWS[view], 0.7)
+    meshes = [box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))]
+    return render_depth(meshes, pose)[0], pose
+
+
+def scaled(pose, factor):
+    return rigid(pose[:3, :3], factor * pose[:3, 3])
+
+
+POSES = {  # a wrong pose of a right one, what is said
+    "OpenGL": (lambda p: p @ GL, r"diag\(1, -1, -1, 1\), if it is OpenGL's"),
+    "inverse": (inverse, "inverse of camera_pose, if it is camera_from_world"),
+    "OpenGL's view matrix": (lambda p: inverse(p @ GL), "OpenGL's view matrix"),
+    "camera_link": (lambda p: p @ inverse(OPTICAL), "optical frame"),
+    "transposed": (lambda p: p.T.contiguous(), "give its transpose"),
+    "millimetres": (lambda p: scaled(p, 1000), "divide camera_pose.* by 1000"),
+    "centimetres": (lambda p: scaled(p, 100), "divide camera_pose.* by 100$|by 100, got"),
+    "scaled": (lambda p: torch.diag(torch.tensor([2.0, 2, 2, 1])).double() @ p, "a rotation times 2"),
+    "left-handed": (lambda p: p @ torch.diag(torch.tensor([-1.0, 1, 1, 1])).double(), "left-handed"),
+    "rounded": (lambda p: torch.round(p, decimals=1), "orthogonal"),
+    "3 x 4": (lambda p: p[:3], "add the row 0 0 0 1"),
+    "16 numbers": (lambda p: p.ravel(), "reshape"),
+    "a quaternion": (lambda p: torch.tensor([0.1, 0.2, 0.3, 0, 0, 0, 1]).double(), "quaternion"),
+}
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("name", POSES)
+def test_a_wrong_pose_is_told_by_what_contradicts_it(name, view):
+    depth, pose = seen(view)
+    assert len(Scene.from_depth(depth, INTRINSICS, pose).things) == 2
+    with pytest.raises(BadArgument, match=f"camera_pose: .*({POSES[name][1]})"):
+        Scene.from_depth(depth, INTRINSICS, POSES[name][0](pose))
+
+
+@pytest.mark.parametrize(
+    "name", ["transposed", "millimetres", "scaled", "left-handed", "rounded", "3 x 4", "a quaternion"]
+)
+def test_a_cloud_refuses_a_pose_that_is_no_pose(name):
+    depth, pose = seen()
+    with pytest.raises(BadArgument, match=POSES[name][1]):
+        cloud_from_depth(depth, INTRINSICS, depth > 0, POSES[name][0](pose))
+
+
+INPUTS = {  # depth in metres and pose to the arguments; what is said
+    "tenths of a millimetre": (lambda d, p: {"depth": np.uint16((1e4 * d).numpy())}, "depth_unit"),
+    "tenths of a millimetre, posed": (
+        lambda d, p: {"depth": np.uint16((1e4 * d).numpy()), "camera_pose": p},
+        "depth_unit",
+    ),
+    "floating millimetres": (lambda d, p: {"depth": 1e3 * d}, "depth_unit=0.001"),
+    "centimetres": (lambda d, p: {"depth": 100 * d}, "depth_unit=0.01"),
+    "counts of centimetres": (lambda d, p: {"depth": np.uint16((10 * d).numpy())}, "depth_unit"),
+    "counts of metres": (lambda d, p: {"depth": torch.round(d).long()}, "depth_unit"),
+    "a unit ten times too small": (lambda d, p: {"depth": 1e3 * d, "depth_unit": 5e-5}, "depth_unit"),
+    "counts per metre": (lambda d, p: {"depth": 1e3 * d, "depth_unit": 1000.0}, "depth_unit"),
+    "upside down": (lambda d, p: {"depth": d.flip(0), "camera_pose": p}, r"depth\[::-1\]"),
+    "up against the table": (lambda d, p: {"depth": d, "camera_pose": p, "up": (0.0, 0.0, -1.0)}, "up"),
+    "OpenGL with up": (lambda d, p: {"depth": d, "camera_pose": p @ GL, "up": (0.0, 0.0, 1.0)}, "OpenGL"),
+    "OpenGL with a table": (lambda d, p: {"depth": d, "camera_pose": p @ GL, "table": 0.0}, "table"),
+    "transposed image": (lambda d, p: {"depth": d.T.contiguous(), "camera_pose": p}, "transposed image"),
+    "half the image": (lambda d, p: {"depth": d[::2, ::2].contiguous()}, "times 0.5"),
+    "twice the image": (lambda d, p: {"depth": d.repeat_interleave(2, 0).repeat_interleave(2, 1)}, "times 2"),
+}
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_a_wrong_unit_or_image_is_told(name):
+    with pytest.raises(BadArgument, match=INPUTS[name][1]):
+        Scene.from_depth(**{"intrinsics": INTRINSICS} | INPUTS[name][0](*seen()))
+
+
+def test_a_stated_unit_and_a_mended_pose_are_used(tmp_path):
+    depth, pose = seen()
+    right = Scene.from_depth(depth, INTRINSICS, pose)
+    tenths = np.uint16(np.round(1e4 * depth.numpy()))
+    for scene in (
+        Scene.from_depth(tenths, INTRINSICS, pose, depth_unit=1e-4),
+        Scene.from_depth(depth, INTRINSICS, (pose @ GL) @ GL),
+        Scene.from_depth(depth, INTRINSICS, inverse(inverse(pose)), up=(0.0, 0.0, 1.0)),
+        read_scene(save_scene(right, tmp_path / "s.npz")),
+    ):
+        assert len(scene.things) == 2 and float(scene.table.normal[2]) > 0.999
+    down = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double() @ pose  # a robot that hangs from the ceiling
+    with pytest.raises(BadArgument, match="up"):
+        Scene.from_depth(depth, INTRINSICS, down)
+    hanging = Scene.from_depth(depth, INTRINSICS, down, up=(0.0, 0.0, -1.0))
+    assert len(read_scene(save_scene(hanging, tmp_path / "h.npz")).things) == 2
+
+
+def test_right_poses_raise_no_alarm():
+    rng = np.random.default_rng(0)
+    depth, pose = seen()
+    for _ in range(6):
+        turn = rotation_from_vector(torch.tensor([0.0, 0.0, rng.uniform(-3, 3)]).double())
+        placed = rigid(turn, torch.tensor(rng.uniform(-2, 2, 3))) @ pose
+        assert len(Scene.from_depth(depth, INTRINSICS, placed).things) == 2
+    for tilt in (0.3, math.pi / 4, 1.2):  # a base on a slope
+        tilted = rigid(rotation_from_vector(torch.tensor([tilt, 0.2, 0.0]).double()), torch.zeros(3).double()) @ pose
+        assert len(Scene.from_depth(depth, INTRINSICS, tilted).things) == 2
+    assert len(Scene.from_depth(depth, INTRINSICS).things) == 2  # the camera's own frame
+    beside = rigid(rotation_from_vector(torch.tensor([0.02, 0.0, 0.01]).double()), torch.tensor([0.015, 0, 0]).double())
+    assert len(Scene.from_depth(depth, INTRINSICS, beside).things) == 2  # the frame of the colour camera
