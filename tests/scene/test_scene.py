@@ -158,7 +158,7 @@ def test_a_target_cut_off_at_the_border_is_told(picture):
         ({"labels": np.zeros((480, 640), int)}, "labels: expected .*got none"),
         ({"labels": np.zeros((4, 6), int)}, "labels: expected .*got shape"),
         ({"table": 2.0}, "table: expected .*got the camera .* below it"),
-        ({"up": (0.0, 0.0, -1.0)}, "table: expected .*got .* above"),
+        ({"up": (0.0, 0.0, -1.0)}, "camera_pose: expected .*another `up`.*180 degrees from up"),
         ({"intrinsics": (308.0, 308.0, 159.5, 119.5)}, "intrinsics: expected .*got a principal point"),
         ({"scale": 1000.0}, "depth: expected a median depth.*got 582 m"),
     ],

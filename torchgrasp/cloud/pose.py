@@ -140,11 +140,9 @@ def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up
     cosine = float(normals[0] @ sky)
     if not fixes and cosine > -math.cos(math.radians(15.0)):
         return  # a frame that is tilted
-    angle, other = math.degrees(math.acos(max(-1.0, cosine))), "z" if up is None else "this `up`"
+    angle, other = math.degrees(math.acos(max(-1.0, cosine))), "`up`, if z is not up" if up is None else "another `up`"
     normal = ", ".join(f"{x:.2f}" for x in normals[0].tolist())
-    allowed = (
-        f"a pose in which the table's normal points up: {' or '.join([*fixes[:3], f'`up`, if {other} is not up'])}"
-    )
+    allowed = f"a pose in which the table's normal points up: {' or '.join([*fixes[:3], other])}"
     raise BadArgument("camera_pose", f"a table whose normal ({normal}) is {angle:.0f} degrees from up", allowed)
 
 
