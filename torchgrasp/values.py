@@ -216,7 +216,8 @@ class Grasps(Batch):
     direction of its straight path there. `clearance` [m] is the least distance of the links from the estimated
     surface, from each other and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle
     between pad axis and contact direction. `score` is the log-odds of the predicted success, which ranks the grasps.
-    `meta` holds names, units, hashes and the seed as text.
+    `known` tells where trials support the prediction; None: everywhere. `meta` holds names, units, hashes and the seed
+    as text.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
@@ -236,12 +237,15 @@ class Grasps(Batch):
     certificate: Annotated[Certificate, Rows("g")]
     score: Annotated[Float[Tensor, "g"], ANY]
     status: Int[Tensor, "g"]
+    known: Bool[Tensor, "g"] | None = None
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     @property
     def success(self) -> Float[Tensor, "g"]:
-        """The predicted probability that each planned grasp holds; 0 if the grasp cannot be executed."""
-        return torch.where(self.status == Status.OK, torch.sigmoid(self.score), 0.0)
+        """The predicted probability that each planned grasp holds; 0 if it cannot be executed, NaN if it is unknown."""
+        likely = torch.sigmoid(self.score)
+        likely = likely if self.known is None else torch.where(self.known, likely, torch.nan)
+        return torch.where(self.status == Status.OK, likely, 0.0)
 
     @checked
     def save(self, path: Path | str) -> None:
@@ -251,6 +255,12 @@ class Grasps(Batch):
             OutputError: the file cannot be written.
         """
         save_tensors(path, "grasps", named_tensors(self), self.meta)
+
+
+def format_success(success: "Grasps | float") -> str:
+    """Return a predicted success, or that of the first grasp, as text: a percentage, or "unknown"."""
+    number = float(success.success[0]) if isinstance(success, Grasps) else success
+    return "unknown" if number != number else f"{number:.0%}"
 
 
 @checked

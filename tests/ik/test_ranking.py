@@ -9,13 +9,16 @@ import pytest
 import torch
 
 from tests.pinch import pinch
+from torchgrasp.base import join
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.ik.ranking import (
     FEATURES,
     centred_friction,
     finger_levers,
+    is_known,
     load_arm,
+    rank_by_success,
     rank_in_group,
     success_features,
     success_log_odds,
@@ -23,7 +26,7 @@ from torchgrasp.ik.ranking import (
 from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Contacts, PointCloud
+from torchgrasp.values import Contacts, PointCloud, format_success
 
 PADS = torch.tensor([[0.1, 0.3, 0.2]], dtype=torch.float64)
 GOOD = torch.tensor([[4.0, 0.3, -1.0, -0.2]])
@@ -79,6 +82,21 @@ def test_every_feature_counts_the_way_it_should(name, hand):
 def test_a_hand_that_the_model_does_not_know_gets_the_least_chance():
     known = [success_log_odds(GOOD, hand) for hand in ("allegro", "barrett")]
     assert float(success_log_odds(GOOD, "mine")) == min(map(float, known))
+
+
+def test_success_is_unknown_beyond_the_trials_and_ranks_after_known_success(ball):
+    _, grasp = pinch("allegro")
+    sure = dataclasses.replace(grasp.contacts, std_m=torch.full((1, 3), 0.003, dtype=torch.float64))
+    unsure = dataclasses.replace(grasp.contacts, std_m=torch.full((1, 3), 0.026, dtype=torch.float64))
+    grasps = join([dataclasses.replace(grasp, contacts=contacts) for contacts in (unsure, sure)])
+    grasps = dataclasses.replace(grasps, score=torch.tensor([3.0, 1.0]).double(), status=torch.zeros(2).long())
+    assert is_known(ball, grasps, 0.3).tolist() == is_known(ball, grasps, 2.0).tolist() == [False, True]
+    assert not bool(is_known(ball, grasps, 0.2).any())
+    large = dataclasses.replace(ball, scale=0.5)
+    assert not bool(is_known(large, grasps, 0.6).any())
+    ranked = rank_by_success(dataclasses.replace(grasps, known=is_known(ball, grasps, 0.6)), torch.tensor([3.0, 1.0]))
+    assert ranked.score.tolist() == [1.0, 3.0]  # both keep their scores
+    assert format_success(ranked) == "73%" and format_success(ranked[1]) == "unknown"
 
 
 @pytest.fixture(scope="module")

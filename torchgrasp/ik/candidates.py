@@ -198,6 +198,7 @@ def check_candidates(
         certificate=certificate,
         score=score(contacts, errors.normal_angle, problem.center),
         status=torch.where(planned == Status.OK, status, planned),
+        known=torch.ones_like(touching),
     )
 
 

@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, Status
@@ -32,7 +32,7 @@ FEATURES = (
 """The features of the model of success, in this order."""
 LEAST_ARM = 0.1  # added to the load's arm over the triangle's height, so that its logarithm is finite
 MODEL = Path(__file__).with_name("success.json")
-"""Weights and bias of the model, and a description of its training data."""
+"""Weights and bias of the model, the range of its trials [m], and a description of its training data."""
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
@@ -138,11 +138,29 @@ def success_log_odds(features: Float[Tensor, "g k"], hand: str) -> Float[Tensor,
     return features @ features.new_tensor([model["weights"][name] for name in FEATURES]) + bias
 
 
+def is_known(shape: ShapeGP, grasps: Grasps, friction: float) -> Bool[Tensor, "g"]:
+    """Return for which grasps the model's trials support its prediction: by friction, size, deviation at contacts.
+
+    More friction than in the trials counts as known: it does not make a grasp worse.
+    """
+    tried = json.loads(MODEL.read_text("utf-8"))["range"]
+    low, high = tried["half_size"]
+    alike = friction >= tried["least_friction"] and low <= shape.scale <= high
+    return alike & (grasps.contacts.require_std().amax(1) <= tried["most_deviation"])
+
+
 def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:
-    """Return grasps scored by the log-odds of the k executable grasps, which come first, best first."""
+    """Return grasps scored by the log-odds of the k executable grasps, in the order of `by_success`."""
     failed, scores = grasps.status != Status.OK, grasps.score.clone()
     scores[~failed] = log_odds.to(scores)
-    return dataclasses.replace(grasps, score=scores)[lexical_order(failed.int(), -scores)]
+    return by_success(dataclasses.replace(grasps, score=scores))
+
+
+def by_success(grasps: Grasps) -> Grasps:
+    """Return executable grasps of known success first, then of unknown success, then failures, by falling score."""
+    late = 2 * (grasps.status != Status.OK).int()
+    late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()
+    return grasps[lexical_order(late, -grasps.score)]
 
 
 def rank_by_variance(grasps: Grasps) -> Grasps:

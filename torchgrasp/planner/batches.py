@@ -13,7 +13,8 @@ from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_as_p
 from torchgrasp.ik.joint import solve_sliding, try_best_seeds
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.ik.ranking import (
-    lexical_order,
+    by_success,
+    is_known,
     rank_by_success,
     rank_by_variance,
     success_features,
@@ -26,7 +27,7 @@ from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, fin
 from torchgrasp.planner.problem import Problem, ignore
 from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import Ranking
-from torchgrasp.values import ContactPlan, Grasps
+from torchgrasp.values import ContactPlan, Grasps, format_success
 
 FIRST, GROWTH = 8, 6
 """Rows of contacts that the hand tries in the first batch, and the ratio of the sizes of successive batches."""
@@ -164,14 +165,15 @@ def rank(problem: Problem, solved: Grasps) -> Grasps:
     if problem.obstacles is not None:
         free = 1 - collision_probability(hand, good, problem.obstacles).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
-    ranked = rank_by_success(solved, log_odds)
+    known = torch.ones_like(solved.status, dtype=torch.bool)
+    known[solved.status == Status.OK] = is_known(problem.shape, good, problem.spec.friction) & (not problem.cut)
+    ranked = rank_by_success(dataclasses.replace(solved, known=known), log_odds)
     return ranked if request.order == "success" else rank_by_variance(ranked)
 
 
 def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:
     """Return the grasps of all batches, the executable ones first, with the metadata of the last batch."""
-    grasps = join(batches)
-    ranked = grasps[lexical_order((grasps.status != Status.OK).int(), -grasps.score)]
+    ranked = by_success(join(batches))
     ranked = ranked if ranking == "success" else rank_by_variance(ranked)
     return dataclasses.replace(ranked, meta=batches[-1].meta)
 
@@ -210,7 +212,7 @@ class Report:
         self.ended += 1
         if self.ended < self.batches:
             good = int(executable(grasps).sum())
-            best = f", the best {float(grasps.success[0]):.0%} likely" if good else ""
+            best = f", the best {format_success(grasps)} likely" if good else ""
             text = f"{self.ended} of {self.batches}: {good} executable of {len(grasps)}{best}"
             self.problem.tell("batch", text, grasps)
         if last and len(self.parts["plan"]) < self.planned:

@@ -210,8 +210,9 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
 
 
 def expected_success(grasps: Grasps) -> float:
-    """Return the mean predicted success of the `BEST` most probable grasps; missing grasps count as failures."""
-    return float(grasps.success.sort(descending=True).values[:BEST].sum()) / BEST
+    """Return the mean of the `BEST` greatest scores as success, known or not; missing grasps count as failures."""
+    likely = torch.where(grasps.status == Status.OK, torch.sigmoid(grasps.score), 0.0)
+    return float(likely.sort(descending=True).values[:BEST].sum()) / BEST
 
 
 def _plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:

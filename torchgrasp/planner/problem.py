@@ -31,6 +31,7 @@ from torchgrasp.plan.starts import Settled, settle_flatness
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.shape.fit import FitOptions, fit_upright
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import Mesh, extract_mesh
@@ -190,6 +191,12 @@ class Problem:
     def center(self) -> Float[Tensor, "3"]:
         """The centre [m] of the estimated surface: the mean of its vertices."""
         return self.surface.vertices.mean(0)
+
+    @cached_property
+    def cut(self) -> bool:
+        """Whether the border of an image cuts the object off."""
+        cloud = self.cloud
+        return cloud.frustum is not None and cloud.viewpoint is not None and silhouettes(cloud.to("cpu")).cut
 
     @cached_property
     def obstacles(self) -> Obstacles | None:

@@ -2,11 +2,12 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
 from torchgrasp.base import Value
-from torchgrasp.checks import Count, Fraction, Seed, checked
+from torchgrasp.checks import Count, Fraction, Measured, Seed, checked
 from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
@@ -27,8 +28,8 @@ from torchgrasp.values import Grasps
 class ThingPlan(Value):
     """The executable grasps of one object in a scene, best first, or the reason why there are none.
 
-    `success` is predicted for the best grasp; without grasps it is 0. `shape` is the estimated shape. `status` names
-    what the picture shows against the object; then nothing was planned.
+    `success` is predicted for the best grasp: 0 without grasps, NaN if it is unknown. `shape` is the estimated shape.
+    `status` names what the picture shows against the object; then nothing was planned.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
@@ -37,7 +38,7 @@ class ThingPlan(Value):
     """
 
     label: int
-    success: float
+    success: Measured
     grasps: Grasps | None = None
     reason: str = ""
     shape: ShapeGP | None = None
@@ -114,7 +115,13 @@ def plan_scene(
             plans.append(ThingPlan(label, 0.0, reason="not tried: another object is easy enough"))
             continue
         plans.append(_plan_thing(dataclasses.replace(scene, target=label), plan))
-    return ScenePlan(tuple(sorted(plans, key=lambda thing: -thing.success)))
+    return ScenePlan(tuple(sorted(plans, key=_order)))
+
+
+def _order(thing: ThingPlan) -> tuple[bool, bool, float]:
+    """Return the key of the order of objects: of known success, of unknown success (NaN), then without a grasp."""
+    unknown = math.isnan(thing.success)
+    return thing.grasps is None, unknown, 0.0 if unknown else -thing.success
 
 
 def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:

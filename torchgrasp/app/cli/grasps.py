@@ -43,6 +43,7 @@ from torchgrasp.scene import Scene, read_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, TrialSpec
+from torchgrasp.values import format_success
 
 if TYPE_CHECKING:
     import trimesh
@@ -201,7 +202,7 @@ class Grasp(Command):
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9)
         for thing in plan.things:
             text = thing.reason or f"{0 if thing.grasps is None else len(thing.grasps)} executable grasps"
-            print(format_line((f"object {thing.label}", f"{thing.success:.0%}", text), (-10, 5, -1)), flush=True)
+            print(format_line((f"object {thing.label}", format_success(thing.success), text), (-10, 7, -1)), flush=True)
         progress.end("objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp")
         if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
             print(f"The {hand.name} hand has no executable grasp of any object in the scene.")

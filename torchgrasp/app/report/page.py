@@ -24,7 +24,7 @@ from torchgrasp.app.report.stills import (
 from torchgrasp.base import count_status
 from torchgrasp.checks import checked
 from torchgrasp.files import write_file
-from torchgrasp.values import Grasps
+from torchgrasp.values import Grasps, format_success
 
 if TYPE_CHECKING:
     import jinja2
@@ -140,7 +140,7 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
     return [
         (
             str(rank),
-            f"{float(grasp.success[0]):.0%}",
+            format_success(grasp),
             f"{1e3 * float(grasp.tip_error[0].max()):.2f}",
             f"{1e3 * float(grasp.clearance[0]):.1f}",
             f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
