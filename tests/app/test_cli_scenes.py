@@ -118,3 +118,13 @@ def test_a_label_needs_a_scene(tmp_path, refusal):
 def test_a_broken_scene_file_is_refused(tmp_path, refusal, data):
     (tmp_path / "scene.npz").write_bytes(data)
     refusal("grasp", tmp_path / "scene.npz", "--out", tmp_path / "out")
+
+
+def test_cloud_scene_tells_a_pose_of_opengl_and_a_wrong_unit(seen, tmp_path, refusal):
+    np.save(tmp_path / "d.npy", seen["depth"])
+    np.savetxt(tmp_path / "gl.txt", seen["camera_pose"] @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    k = [str(float(INTRINSICS[i, j])) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    words = ["cloud", "scene", tmp_path / "d.npy", "--intrinsics", *k, "--out", tmp_path / "s.npz"]
+    error = refusal(*words, "--camera-pose", tmp_path / "gl.txt")
+    assert error.startswith("--camera-pose: ") and "OpenGL" in error and not (tmp_path / "s.npz").exists()
+    assert "--depth-unit" in refusal(*words, "--depth-unit", "0.01")

@@ -98,7 +98,7 @@ def find_plausible(
         supports = find_table(points, eye, table, up)
     except NoSupport:
         middle = float(((points - eye) @ pose[:3, 2]).median())
-        if table is None and not known_unit and not 0.15 < middle < 4.0:
+        if table is None and not 0.15 < middle < 4.0:
             found = f"a median depth of {middle:.3g} m, and no table"
             raise BadArgument("depth", found, UNIT) from None
         if up is not None and table is None and not own:
