@@ -1,7 +1,6 @@
 """Clouds with outward normals and without outliers, to which a shape is fitted; views merged into one cloud."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import torch
@@ -13,9 +12,10 @@ from torchgrasp.checks import checked
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics, nearest
 from torchgrasp.cloud.pose import check_rigid
+from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import fibonacci_sphere, unit, unit_of_any
+from torchgrasp.geometry.linalg import unit, unit_of_any
 from torchgrasp.values import PointCloud
 
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
@@ -56,7 +56,9 @@ class PreparedCloud(Value):
 
 
 @checked
-def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = True) -> PreparedCloud:
+def prepare_cloud(
+    cloud: PointCloud, generator: torch.Generator, clean: bool = True, up: Float[Tensor, "3"] | None = None
+) -> PreparedCloud:
     """Check a cloud, and return the points and normals to which a shape is fitted.
 
     Normals of random signs are ignored, since they make a view look whole. If `clean`, a viewpoint that the given
@@ -66,6 +68,7 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
         cloud: points [m] of one or several views of one object.
         generator: draws 2000 of the points if there are more.
         clean: remove outliers, fit all normals anew and estimate a missing viewpoint; else fit missing normals only.
+        up: the vertical, below which no viewpoint is estimated.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras, each of which costs an outline.
@@ -88,10 +91,10 @@ def prepare_cloud(cloud: PointCloud, generator: torch.Generator, clean: bool = T
         viewpoint = None
     cloud = dataclasses.replace(cloud, normals=normals, viewpoint=viewpoint)
     if clean or normals is None:
-        cloud = _fit_normals(cloud, clean)
+        cloud = _fit_normals(cloud, clean, up)
     precise = cloud.to(torch.float64)
     if clean and precise.viewpoint is None:
-        guess = guess_viewpoint(precise.points, fit_planes(precise.points)[0]).to(points.dtype)
+        guess = guess_viewpoint(precise.points, fit_planes(precise.points)[0], up)[0].to(points.dtype)
         precise = dataclasses.replace(precise, viewpoint=guess.double())
     if len(precise) > MAX_POINTS:
         precise = precise.select(torch.randperm(len(precise), generator=generator)[:MAX_POINTS].to(points.device))
@@ -125,7 +128,7 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
     return _fit_normals(remove_duplicates(cloud), clean=True)
 
 
-def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
+def _fit_normals(cloud: PointCloud, clean: bool, up: Float[Tensor, "3"] | None = None) -> PointCloud:
     """Fit outward normals to distinct points, and clean them if asked."""
     if clean:
         cloud = cloud.select(find_inliers(cloud.points.double()))
@@ -140,7 +143,7 @@ def _fit_normals(cloud: PointCloud, clean: bool) -> PointCloud:
         outward = cloud.normals.double()
     else:
         if viewpoint is None:
-            viewpoint = guess_viewpoint(points.double(), normals).to(points.dtype)
+            viewpoint = guess_viewpoint(points.double(), normals, up)[0].to(points.dtype)
         outward = viewpoint.double() - points.double()
     normals = orient_normals(normals, outward).to(points.dtype)
     return dataclasses.replace(cloud, points=points, normals=normals, viewpoint=viewpoint)
@@ -161,31 +164,6 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     flipped = 2 * against.sum(-1) > compared.sum(-1)
     # Random signs oppose half of the pairs.
     return NormalCheck(flipped, opposed, oriented=opposed < 0.35, scaled=int(scaled.sum()))
-
-
-def guess_viewpoint(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    """Return a camera position [m] that explains a single view, for normals of unknown sign.
-
-    Normals of a view face the camera, and objects bulge. The direction v maximises sum_i w_i tanh(n_i.v / 0.3),
-    where w_i = n_i.(p_i - centre) makes the sign of n_i irrelevant. The centre is that of the principal box. The
-    camera is 4 radii away. The origin is preferred if it scores 0.8 of the best and the cloud looks like a cloud in
-    its camera's frame: within 45 degrees of z, more than 2 radii away. The sides of a flat face or a bowl look alike.
-    """
-    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh  # independent of the frame
-    along = points @ axes.T
-    centre = (along.amax(0) + along.amin(0)) / 2 @ axes
-    radius = torch.linalg.vector_norm(points - centre, dim=-1).max()
-    bulge = (normals * (points - centre)).sum(-1)
-    directions = fibonacci_sphere(400).to(points)  # about 10 degrees apart
-    away = torch.linalg.vector_norm(centre)
-    origin = -centre / away.clamp_min(1e-300)
-    pieces = torch.cat([directions, origin[None]]).split(64)  # bounds the memory for whole depth images
-    score = torch.cat([(bulge[:, None] * torch.tanh(normals @ piece.T / 0.3)).mean(0) for piece in pieces])
-    best = score[:-1].argmax()
-    in_camera_frame = (centre[2] > math.cos(math.pi / 4) * away) & (away > 2 * radius)
-    if bool(in_camera_frame & (score[-1] >= 0.8 * score[best])):
-        return torch.zeros_like(centre)
-    return centre + 4 * radius * directions[best]
 
 
 def orient_normals(normals: Float[Tensor, "n 3"], outward: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

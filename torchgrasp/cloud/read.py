@@ -16,8 +16,8 @@ from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
-from torchgrasp.cloud.prepare import guess_viewpoint
 from torchgrasp.cloud.tables import parse_npy, parse_npz, read_lines
+from torchgrasp.cloud.viewpoint import can_see
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.files import is_file, read_bytes, write_file
 from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
@@ -279,11 +279,12 @@ def _find_measured(points: Tensor, normals: Tensor | None, notes: list[str]) -> 
 
 
 def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
-    """Keep the viewpoint (0, 0, 0) only if the points look as if seen from the origin."""
+    """Keep the viewpoint (0, 0, 0) only if a camera can have been there."""
     points = cloud.points[draw_rows(len(cloud), 2000)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]
-        if not bool(guess_viewpoint(points, fit_planes(points)[0]).any()):
+        if can_see(points, fit_planes(points)[0], torch.zeros(3, dtype=points.dtype)):
             return cloud
-    notes.append("the default viewpoint (0, 0, 0), which the points do not face, was left out (--viewpoint gives one)")
+    default = "the default viewpoint (0, 0, 0) of PCD"
+    notes.append(f"{default}, from which a camera cannot have seen these points, was left out (--viewpoint gives one)")
     return PointCloud(cloud.points, cloud.normals)

@@ -120,7 +120,8 @@ def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitO
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
     generator, noise = torch.Generator().manual_seed(seed), options.noise
-    seen = prepare_cloud(cloud, generator, clean=options.support == "camera")
+    up = None if table is None else torch.tensor([0.0, 0.0, 1.0])
+    seen = prepare_cloud(cloud, generator, clean=options.support == "camera", up=up)
     if options.support == "paper":
         return _fit_surface(seen, paper_support(seen, noise, generator), options)
     if not seen.one_sided:

@@ -1,0 +1,136 @@
+"""Where the camera of a view was: a guess, and whether a camera can have been at a place."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.neighbours import draw_rows, nearest
+from torchgrasp.cloud.support import fit_support
+from torchgrasp.errors import NoSupport
+from torchgrasp.geometry.linalg import fibonacci_sphere, unit
+
+MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
+"""Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""
+DRAWN = 2000  # most points that tell where the camera was
+
+
+def guess_viewpoint(
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    up: Float[Tensor, "3"] | None = None,
+    assumed: bool = False,
+) -> tuple[Float[Tensor, "3"], float]:
+    """Return a camera position [m] that explains a view, and the angle [deg] within which the camera is likely.
+
+    Of the directions above the support, the one that `_explain` rates highest is taken, 4 radii away. The origin is
+    preferred if the view is in front of it and it can have been the camera. 180 degrees: the points hardly tell.
+
+    Args:
+        points: of a view [m], without outliers.
+        normals: of unit length and any sign.
+        up: a direction above the support; the normal of a support in the points counts more.
+        assumed: whether `up` is assumed, so that the cloud may be in its camera's frame instead.
+    """
+    rows = draw_rows(len(points), DRAWN).to(points.device)
+    points, normals = points[rows], normals[rows]
+    in_front = points[:, 2] > math.cos(math.radians(50)) * torch.linalg.vector_norm(points, dim=-1)
+    above = up is None or assumed or float(points.mean(0) @ up.to(points)) < 0
+    if above and bool(in_front.all()) and can_see(points, normals, torch.zeros_like(points[0])):
+        return torch.zeros_like(points[0]), 0.0
+    try:
+        up = fit_support(points, up=up).normal
+    except NoSupport:
+        pass
+    directions = fibonacci_sphere(400).to(points)  # about 10 degrees apart
+    if up is not None:
+        directions = directions[directions @ up.to(points) > 0.1]
+    centre, radius = _enclose(points)
+    bulge, density = _explain(points, normals, centre + 4 * radius * directions)
+    score = bulge + 3 * density  # wrong cameras were rarest with three
+    best = score.argmax()
+    rivals = directions[score > score[best] - 0.3] @ directions[best]
+    angle = max(15.0, math.degrees(math.acos(min(float(rivals.min()), 1.0))))
+    return centre + 4 * radius * directions[best], angle if score[best] > 1 else 180.0
+
+
+def can_see(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> bool:
+    """Return whether a view looks as if seen from a place [m].
+
+    Points must not hide others there. Besides, either their density is that of pixels, or hardly any other place
+    explains them better, or a support is seen from above.
+    """
+    rows = draw_rows(len(points), DRAWN).to(points.device)
+    points, normals = points[rows], normals[rows]
+    edge_on, behind = share_unseen(points, normals, viewpoint)
+    if edge_on > MAX_EDGE_ON or behind > MAX_BEHIND:
+        return False
+    centre, radius = _enclose(points)
+    others = centre + 4 * radius * fibonacci_sphere(400).to(points)
+    bulge, density = _explain(points, normals, torch.cat([viewpoint[None], others]))
+    score = bulge + 3 * density
+    if bool(density[0] > 0) or bool(score[0] > score.max() - 0.5):
+        return True
+    try:
+        fit_support(points, viewpoint)
+    except NoSupport:
+        return False
+    return True
+
+
+def _enclose(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+    """Return the centre of the box along the principal axes, and the distance of the farthest point from it."""
+    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh  # independent of the frame
+    along = points @ axes.T
+    centre = (along.amax(0) + along.amin(0)) / 2 @ axes
+    return centre, torch.linalg.vector_norm(points - centre, dim=-1).max()
+
+
+def _explain(
+    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoints: Float[Tensor, "k 3"]
+) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
+    """Return how well cameras explain that objects bulge towards them, and the density of the points; 1: wholly.
+
+    A pixel covers an area of surface that grows with the squared distance, over the cosine between ray and normal.
+    """
+    away = viewpoints - points[:, None]
+    distance = torch.linalg.vector_norm(away, dim=-1).clamp_min(1e-12)
+    cosine = (away * normals[:, None]).sum(-1) / distance
+    bulge = (normals * (points - _enclose(points)[0])).sum(-1)
+    bulging = (bulge[:, None] * torch.tanh(cosine / 0.3)).sum(0) / bulge.abs().sum().clamp_min(1e-12)
+    density = -2 * torch.log(nearest(points, 13)[0][:, -1].clamp_min(1e-12))  # up to a constant
+    density = density - density.median()
+    error = density[:, None] - torch.log(cosine.abs().clamp_min(0.1)) + 2 * torch.log(distance)
+    error = (error - error.median(0).values).abs().mean(0)
+    return bulging, 1 - error / density.abs().mean().clamp_min(1e-12)
+
+
+def share_unseen(
+    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
+) -> tuple[float, float]:
+    """Return the shares of points that a camera would see edge-on, and of points behind others or behind the camera.
+
+    Args:
+        points: without outliers [m].
+        normals: of unit length and any sign.
+        viewpoint: the camera [m].
+    """
+    from scipy.spatial import KDTree
+
+    ray = unit(points - viewpoint)
+    edge_on = float(((ray * normals).sum(-1).abs() < 0.17).double().mean())  # the cosine of 80 degrees
+    middle = (points.amax(0) + points.amin(0)) / 2
+    forward = middle - viewpoint
+    if not bool(forward.any()) or bool(((points - viewpoint) @ forward <= 0).any()):
+        return edge_on, 1.0  # within the cloud, or beside it
+    axes = torch.linalg.svd(unit(forward)[None]).Vh  # forward, or backward, and two axes across
+    local = (points - viewpoint) @ axes.T
+    depth = local[:, 0].abs()
+    pixels = (local[:, 1:] / depth[:, None]).cpu().numpy()
+    apart, index = KDTree(pixels).query(pixels, k=min(6, len(pixels)))
+    # a point lies behind a neighbour if it is deeper by more than a slope explains
+    step = (depth[:, None] - depth[torch.from_numpy(index).to(depth.device)]).abs()
+    step = step - 2 * torch.from_numpy(apart).to(depth) * depth[:, None]
+    radius = torch.linalg.vector_norm(points - middle, dim=-1).max()
+    return edge_on, float((step.amax(1) > 0.1 * radius).double().mean())
