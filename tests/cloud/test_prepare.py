@@ -12,10 +12,10 @@ from torchgrasp.cloud.prepare import (
     clean_cloud,
     compare_normals,
     estimate_normals,
-    guess_viewpoint,
     prepare_cloud,
     share_facing,
 )
+from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import TooFewPoints
 from torchgrasp.geometry.frames import apply, inverse
@@ -38,7 +38,7 @@ def check_normals(cloud):
 
 
 def estimate_viewpoint(cloud):
-    return guess_viewpoint(cloud.points, fit_planes(cloud.points)[0])
+    return guess_viewpoint(cloud.points, fit_planes(cloud.points)[0])[0]
 
 
 def flip(cloud, share, seed=0):

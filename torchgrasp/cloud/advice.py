@@ -9,15 +9,19 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
-from torchgrasp.cloud.parts import LEVEL, find_second_body, find_support
+from torchgrasp.cloud.parts import LAYER, find_second_body
 from torchgrasp.cloud.prepare import FACING, share_facing
+<<<<<<< HEAD
 from torchgrasp.errors import BadArgument
+=======
+from torchgrasp.cloud.support import LEAST_WIDTH, find_supports
+from torchgrasp.cloud.viewpoint import MAX_BEHIND, MAX_EDGE_ON, share_unseen
+from torchgrasp.errors import NoSupport
+>>>>>>> 5f3e8be (check and cut use the one plane finder; a cloud in its camera's frame is told with --viewpoint 0 0 0; a guess says how sure it is)
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
-MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
-"""Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""
 FEWEST = 50  # fewest points that show whether a camera is right, or whether pixels fly off rims
 
 
@@ -61,6 +65,7 @@ def judge_view(
         advice = _judge_camera(clean, given)
     # An estimate may be on the wrong side of a table, but not where it is the origin of a camera's frame.
     trusted = eye is not None and facing >= FACING and (given or not bool(eye.any()))
+<<<<<<< HEAD
     support = find_support(points, normals, up, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None)
     if stands and table is not None:
         try:
@@ -69,6 +74,9 @@ def judge_view(
             advice.append(
                 Advice(f"a table that contradicts the cloud, {error.found}", f"--table, {error.allowed}", True)
             )
+=======
+    support = _find_support(points, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None, up)
+>>>>>>> 5f3e8be (check and cut use the one plane finder; a cloud in its camera's frame is told with --viewpoint 0 0 0; a guess says how sure it is)
     if stands and eye is not None and facing >= FACING:
         advice += _judge_height(points, eye, given, up, table, support)
         down = float((normals @ up < -0.5).double().mean())
@@ -84,6 +92,19 @@ def judge_view(
         fix = f"one object: torchgrasp cloud cut CLOUD --point {x:.3f} {y:.3f} {z:.3f} --out FILE"
         advice.append(Advice(found, fix, True))
     return sorted(advice, key=lambda a: not a.refused)
+
+
+def _find_support(
+    points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None, up: Float[Tensor, "3"]
+) -> tuple[Plane, float] | None:
+    """Return a support that was left in, even a narrow one, and its share of the points; a camera shows any tilt."""
+    for sky, width in ((up, 0.06), *([(None, LEAST_WIDTH)] if eye is not None else [])):
+        try:
+            plane = find_supports(points, eye, sky, least_width=width)[0].plane
+        except NoSupport:
+            continue
+        return plane, float((plane.height(points).abs() < LAYER).double().mean())
+    return None
 
 
 def _judge_facing(facing: float) -> list[Advice]:
@@ -134,16 +155,16 @@ def _judge_height(
     ground = "the lowest point" if table is None else "the table"
     place = f"{below:.2f} m below {ground} along the vertical {_triple(normal)}"
     centre = points.mean(0)
-    far = 2 * float(torch.linalg.vector_norm(points - centre, dim=-1).max())
-    forward = float(centre[2]) > max(far, 0.7 * float(torch.linalg.vector_norm(centre))) and float(up[2]) > 0.9
+    forward = float(centre[2]) > 0.6 * float(torch.linalg.vector_norm(centre)) and float(up[2]) > 0.9
     if forward and not bool(eye.any()):
         axis, why = torch.tensor([0.0, -1.0, 0.0]), "for a level camera"
         if support is not None:
             axis, why = support[0].normal, "the normal of the plane in it"
         found = f"a cloud in its camera's frame, whose z axis points forward: the camera is {place}"
-        return [
-            Advice(found, f"a vertical that points up: --up {_triple(axis, ' ')} ({why}), or --camera-pose FILE", True)
-        ]
+        options = f"{'' if given else '--viewpoint 0 0 0 '}--up {_triple(axis, ' ')}"
+        fix = f"a vertical that points up: {options} ({why}), or --camera-pose FILE"
+        fix += "" if given else "; or, if z points up, --up 0 0 1"
+        return [Advice(found, fix, True)]
     if not given:
         return [Advice(f"an estimated camera {place}", "the true camera: --viewpoint X Y Z", False)]
     fix = f"a camera above it: --viewpoint X Y Z; or, if {_triple(up)} points down, --up {_triple(-up, ' ')}"
@@ -152,7 +173,7 @@ def _judge_height(
 
 def _describe_support(plane: Plane, share: float, up: Float[Tensor, "3"]) -> Advice:
     """Describe the table that was left in the cloud."""
-    turn = f" --up {_triple(plane.normal, ' ')}, its normal," if float(plane.normal @ up) < LEVEL else ""
+    turn = f" --up {_triple(plane.normal, ' ')}, its normal," if float(plane.normal @ up) < 0.97 else ""
     found = f"a plane under the object, a table left in, with {share:.0%} of the points"
     return Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True)
 
@@ -180,32 +201,3 @@ def _triple(vector: Tensor, between: str = ", ") -> str:
     """Return three numbers for a sentence or for a command."""
     numbers = between.join(f"{0.0 + round(x, 3):g}" for x in vector.tolist())
     return numbers if between == " " else f"({numbers})"
-
-
-def share_unseen(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
-) -> tuple[float, float]:
-    """Return the shares of points that a camera would see edge-on, and of points behind others or behind the camera.
-
-    Args:
-        points: without outliers [m].
-        normals: of unit length and any sign.
-        viewpoint: the camera [m].
-    """
-    from scipy.spatial import KDTree
-
-    ray = unit(points - viewpoint)
-    edge_on = float(((ray * normals).sum(-1).abs() < 0.17).double().mean())  # the cosine of 80 degrees
-    middle = (points.amax(0) + points.amin(0)) / 2
-    forward = middle - viewpoint
-    if not bool(forward.any()) or bool(((points - viewpoint) @ forward <= 0).any()):
-        return edge_on, 1.0  # within the cloud, or beside it
-    axes = torch.linalg.svd(unit(forward)[None]).Vh  # forward, or backward, and two axes across
-    local = (points - viewpoint) @ axes.T
-    depth = local[:, 0].abs()
-    pixels = local[:, 1:] / depth[:, None]
-    apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(6, len(pixels)))
-    # a point lies behind a neighbour if it is deeper by more than a slope explains
-    step = (depth[:, None] - depth[torch.from_numpy(index)]).abs() - 2 * torch.from_numpy(apart) * depth[:, None]
-    radius = torch.linalg.vector_norm(points - middle, dim=-1).max()
-    return edge_on, float((step.amax(1) > 0.1 * radius).double().mean())

@@ -13,6 +13,7 @@ from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, nearest
 from torchgrasp.cloud.prepare import MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
+from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
@@ -55,7 +56,7 @@ def diagnose_cloud(
 
     Args:
         cloud: points of one object [m].
-        up: the vertical, of any length; None: z.
+        up: the vertical, of any length; None: z is assumed, unless the cloud looks like one in its camera's frame.
         table: None: at the lowest point.
         stands: whether the object stands on a table; else the camera may be below it.
 
@@ -79,7 +80,12 @@ def diagnose_cloud(
     check = None if view.normals is None else compare_normals(view.points.double(), view.normals.double())
     if check is not None and not check.oriented:
         view = PointCloud(view.points, None, view.viewpoint)
-    clean = clean_cloud(view)
+    vertical, guessed, angle = unit(vertical.double()), view, 0.0
+    if view.viewpoint is None and view.normals is None:
+        seen = view.points.double()[find_inliers(view.points.double())]
+        eye, angle = guess_viewpoint(seen, fit_planes(seen)[0], vertical, assumed=up is None)
+        guessed = dataclasses.replace(view, viewpoint=eye.to(view.points))
+    clean = clean_cloud(guessed)
     # Clean normals face the viewpoint by construction; given normals may be those of a whole surface.
     judged = clean if view.normals is None else view
     viewpoint = clean.viewpoint if judged.viewpoint is None else judged.viewpoint
@@ -100,10 +106,10 @@ def diagnose_cloud(
         facing=0.0 if viewpoint is None else share_facing(judged.points, judged.normals, viewpoint),
         advice=(),
     )
-    advice = judge_view(view, clean, unit(vertical.double()), table, stands)
+    advice = judge_view(view, clean, vertical, table, stands)
     if clean.viewpoint is not None and clean.viewpoint.ndim == 1:
         advice += judge_pixels(view, clean.viewpoint)
-    return dataclasses.replace(report, advice=(*advice, *_advise(report, clean)))
+    return dataclasses.replace(report, advice=(*advice, *_advise(report, clean, angle)))
 
 
 @checked
@@ -142,8 +148,8 @@ def format_report(report: CloudReport) -> str:
     return "\n".join(f"{name:12}{text}" for name, text in lines)
 
 
-def _advise(report: CloudReport, clean: PointCloud) -> list[Advice]:
-    """Return advice on size, density, noise, outliers, flatness, normals and a missing viewpoint."""
+def _advise(report: CloudReport, clean: PointCloud, angle: float) -> list[Advice]:
+    """Return advice on size, density, noise, outliers, flatness, normals and a viewpoint within an angle [deg]."""
     longest, outliers, given = max(report.size), report.outliers / report.points, report.viewpoint_given
     voxel = 1.0 / math.sqrt(max(report.density * MAX_POINTS / report.points, 1e-12))
     thickness, _, length = torch.linalg.svdvals((clean.points - clean.points.mean(0)).double()).sort().values.tolist()
@@ -152,6 +158,7 @@ def _advise(report: CloudReport, clean: PointCloud) -> list[Advice]:
     cut, thin = "torchgrasp cloud cut CLOUD --out FILE", f"torchgrasp cloud thin CLOUD --voxel {voxel:.2g} --out FILE"
     many = f"{report.points} points, of which {MAX_POINTS} are used"
     sparse = f"{1e3 * report.spacing:.0f} mm between points, so that the shape is mostly guessed"
+    guess = f"a camera whose position is a guess, {f'to {angle:.0f} degrees' if angle < 180 else 'on weak evidence'}"
     rules = [
         (longest > 0.4, f"a length of {longest:.2f} m, large for a hand, as of a whole scene", f"one object: {cut}"),
         (report.points > 2 * MAX_POINTS, many, f"as many: {thin}"),
@@ -161,6 +168,6 @@ def _advise(report: CloudReport, clean: PointCloud) -> list[Advice]:
         (thickness < 1e-3 * length, "points all in one plane, so that the thickness is a guess", "a view of two sides"),
         (bool(check and check.oriented) and flipped > 0.03, f"{flipped:.0%} flipped normals", "none: --no-normals"),
         (bool(check and not check.oriented), "normals of random signs, which are ignored", "none: --no-normals"),
-        (report.viewpoint is not None and not given, "a camera whose position is a guess", "--viewpoint X Y Z"),
+        (report.viewpoint is not None and not given, guess, "--viewpoint X Y Z"),
     ]
     return [Advice(found, fix, False) for applies, found, fix in rules if applies]

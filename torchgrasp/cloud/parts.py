@@ -1,6 +1,5 @@
-"""The parts of a cloud: the support that an object stands on, and bodies that lie apart."""
+"""The parts of a cloud: one object on a support, and bodies that lie apart."""
 
-import math
 from typing import Annotated
 
 import numpy as np
@@ -10,79 +9,13 @@ from torch import Tensor
 
 from torchgrasp.checks import Range, checked
 from torchgrasp.cloud.check import MIN_POINTS, first_of_each
-from torchgrasp.cloud.neighbours import draw_rows, fit_planes
-from torchgrasp.errors import TooFewPoints
+from torchgrasp.cloud.support import Support, find_supports
+from torchgrasp.errors import NoSupport, TooFewPoints
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
 
-LAYER = 0.004  # half thickness [m] of a support's layer, for the noise of a depth camera at half a metre
-LEVEL = math.cos(math.radians(15))  # least cosine between the vertical and the normal of a level plane
-MIN_SUPPORT, STRAYS = 0.15, 0.02
-"""Least share of the points in a support's layer; share of stray points, of which more lie above it and fewer below."""
-MIN_WIDTH = 0.05  # least width [m] of a support; the side of a pen is narrower
+LAYER = 0.004  # least half thickness [m] of a support's layer, for the noise of a depth camera at half a metre
 GAP = 0.04  # least distance [m] between bodies; a bent or hidden surface of one body leaves smaller gaps
-
-
-def find_support(
-    points: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    up: Float[Tensor, "3"],
-    viewpoint: Float[Tensor, "3"] | None,
-    spread: float = 1.3,
-) -> tuple[Plane, float] | None:
-    """Return the largest plane on which the other points seem to stand, and its share of the points, if any.
-
-    Args:
-        points: of a view [m].
-        normals: of unit length and any sign.
-        up: the vertical, of unit length.
-        viewpoint: the camera [m], which sees the upper side; None: only level planes are found.
-        spread: least area of the support over the area above it; the bottom of a bowl is smaller than its rim.
-    """
-    rows = torch.linspace(0, len(points) - 1, min(200, len(points))).long()  # planes through points with normals
-    normal, foot = normals[rows], points[rows]
-    turned = math.cos(math.radians(25))  # noise turns normals
-    for _ in range(3):
-        side = up.expand_as(foot) if viewpoint is None else viewpoint - foot
-        normal = torch.where(((normal * side).sum(-1) < 0)[:, None], -normal, normal)
-        height = points @ normal.T - (normal * foot).sum(-1)
-        layer = (height.abs() < LAYER) & ((normals @ normal.T).abs() > turned)
-        share = layer.double().mean(0)
-        order = share.argsort(descending=True)[:40]
-        fitted = [_fit(points[layer[:, k]]) for k in order.tolist() if int(layer[:, k].sum()) >= 3]
-        if not fitted:
-            return None
-        found = (share >= MIN_SUPPORT) & ((height < -2 * LAYER).double().mean(0) <= STRAYS)
-        found &= (height > 2 * LAYER).double().mean(0) >= STRAYS
-        if viewpoint is None:
-            found &= normal @ up > LEVEL
-        for k in order.tolist():
-            if bool(found[k]):
-                area, width = _measure(points[layer[:, k]], normal[k])
-                aloft, _ = _measure(points[height[:, k] > 2 * LAYER], normal[k])
-                if area > spread * aloft and width > MIN_WIDTH:
-                    return Plane(normal[k], float(normal[k] @ foot[k])), float(share[k])
-        foot, normal = torch.stack([f for f, _ in fitted]), torch.stack([n for _, n in fitted])
-    return None
-
-
-def _measure(points: Float[Tensor, "n 3"], normal: Float[Tensor, "3"]) -> tuple[float, float]:
-    """Return the area [m2] of the convex hull of points, seen along a normal, and its smaller width [m]."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    flat = points @ torch.linalg.svd(normal[None]).Vh[1:].T
-    try:
-        hull = ConvexHull(flat.numpy())
-    except (QhullError, ValueError):  # fewer than three points, or all on a line
-        return 0.0, 0.0
-    width = math.sqrt(12.0 * float(torch.linalg.eigvalsh(torch.cov(flat.T, correction=0))[0]))  # as of a rectangle
-    return float(hull.volume), width  # of two dimensions the area
-
-
-def _fit(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return a point and the normal of the plane through points."""
-    centre = points.mean(0)
-    return centre, torch.linalg.eigh((points - centre).T @ (points - centre)).eigenvectors[:, 0]
 
 
 def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, "n"]:
@@ -124,7 +57,7 @@ def cut_object(
     box: Float[Tensor, "2 3"] | None = None,
     gap: Annotated[float, Range(0.001, 1.0)] = GAP,
 ) -> tuple[PointCloud, Plane | None]:
-    """Return the points of one object that stands on a plane, and the plane if one was found.
+    """Return the points of one object that stands on a support, and the support's plane if one was found.
 
     Args:
         cloud: points [m] of a scene.
@@ -150,21 +83,30 @@ def cut_object(
     if point is not None:
         keep &= torch.linalg.vector_norm(points - point, dim=-1) < 0.5
     cloud = _select(cloud, keep, "points in the box and near the point")
+    support = _find_support(cloud, up)
+    if support is not None:
+        height = support.plane.height(cloud.points.double())
+        spread = float(height[height.abs() < 0.02].abs().median().nan_to_num())  # of the noise of the support
+        cloud = _select(cloud, height > max(LAYER, 5 * spread), "points above the plane")
     points = cloud.points.double()
-    rows = draw_rows(len(points), 5000)
-    eye = cloud.viewpoint if cloud.viewpoint is None or cloud.viewpoint.ndim == 1 else cloud.viewpoint.mean(0)
-    some = points[rows]
-    normals = fit_planes(some)[0]
-    support = find_support(some, normals, up, None, spread=0.0)
-    if support is None and eye is not None:
-        support = find_support(some, normals, up, eye.double(), spread=0.0)
-    plane = None if support is None else support[0]
-    if plane is not None:
-        cloud = _select(cloud, plane.height(points) > LAYER, "points above the plane")
-        points = cloud.points.double()
     label = label_bodies(points, gap)
-    wanted = 0 if point is None else int(label[torch.linalg.vector_norm(points - point, dim=-1).argmin()])
-    return _select(cloud, label == wanted, "points of the object"), plane
+    if point is not None:
+        wanted = int(label[torch.linalg.vector_norm(points - point, dim=-1).argmin()])
+    else:
+        over = label if support is None else label[support.covers(points)]
+        wanted = int((over if len(over) else label).mode().values)
+    return _select(cloud, label == wanted, "points of the object"), None if support is None else support.plane
+
+
+def _find_support(cloud: PointCloud, up: Float[Tensor, "3"]) -> Support | None:
+    """Return the support of a scene: near level, or any that its camera looks down on."""
+    eye = cloud.viewpoint if cloud.viewpoint is None or cloud.viewpoint.ndim == 1 else cloud.viewpoint.mean(0)
+    for sky in (up, *([None] if eye is not None else [])):
+        try:
+            return find_supports(cloud.points, eye, sky)[0]
+        except NoSupport:
+            continue
+    return None
 
 
 def _select(cloud: PointCloud, keep: Bool[Tensor, "n"], what: str) -> PointCloud:

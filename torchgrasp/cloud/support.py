@@ -89,6 +89,7 @@ def find_supports(
     up: Float[Tensor, "3"] | None = None,
     *,
     seed: int = 0,
+    least_width: float = LEAST_WIDTH,
 ) -> tuple[Support, ...]:
     """Return the supports in a view, the most plausible first, whatever the frame.
 
@@ -102,6 +103,7 @@ def find_supports(
         viewpoint: the camera's position [m], on the upper side; None: the side with more points is the upper one.
         up: against gravity, of any length; None: any direction.
         seed: of the draws.
+        least_width: of the region of a support [m].
 
     Raises:
         BadArgument: a wrong shape or type, or points that are not finite.
@@ -120,7 +122,7 @@ def find_supports(
     found: list[_Candidate] = []
     reasons: list[str] = []
     for fit in fit_planes(view, generator):
-        judged = _judge(view, fit.turned_up(view))
+        judged = _judge(view, fit.turned_up(view), least_width)
         if isinstance(judged, str):
             reasons.append(judged)
         elif not any(judged.repeats(other) for other in found):
@@ -248,7 +250,7 @@ def _ordered(found: list[_Candidate]) -> list[_Candidate]:
     return [first, *sorted((c for c in found if c is not first), key=lambda candidate: -candidate.score)]
 
 
-def _judge(view: View, fit: PlaneFit) -> _Candidate | str:
+def _judge(view: View, fit: PlaneFit, least_width: float) -> _Candidate | str:
     """Return a plane as a candidate, or why it is no support."""
     points, height = view.points, view.points @ fit.normal - fit.offset
     tolerance = 4 * fit.scale * view.noise + 0.001
@@ -262,7 +264,7 @@ def _judge(view: View, fit: PlaneFit) -> _Candidate | str:
     on = height.abs() < tolerance
     plane = Plane(fit.normal, fit.offset)
     support = bound(plane, points, on, view.eye)
-    if support is None or support.width < LEAST_WIDTH:
+    if support is None or support.width < least_width:
         return f"a flat face about {0.0 if support is None else support.width:.2f} m wide"
     middle = points[on & support.covers(points)].mean(0)
     if view.eye is not None and float(unit(view.eye - middle) @ fit.normal) < math.sin(math.radians(5.0)):

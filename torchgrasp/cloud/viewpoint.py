@@ -36,9 +36,11 @@ def guess_viewpoint(
     rows = draw_rows(len(points), DRAWN).to(points.device)
     points, normals = points[rows], normals[rows]
     in_front = points[:, 2] > math.cos(math.radians(50)) * torch.linalg.vector_norm(points, dim=-1)
-    above = up is None or assumed or float(points.mean(0) @ up.to(points)) < 0
-    if above and bool(in_front.all()) and can_see(points, normals, torch.zeros_like(points[0])):
-        return torch.zeros_like(points[0]), 0.0
+    centre, radius = _enclose(points)
+    above = up is None or assumed or float(centre @ up.to(points)) < 0
+    far = bool(torch.linalg.vector_norm(centre) > 2 * radius)
+    if far and above and bool(in_front.all()) and can_see(points, normals, torch.zeros_like(points[0])):
+        return torch.zeros_like(points[0]), 15.0
     try:
         up = fit_support(points, up=up).normal
     except NoSupport:
@@ -46,7 +48,6 @@ def guess_viewpoint(
     directions = fibonacci_sphere(400).to(points)  # about 10 degrees apart
     if up is not None:
         directions = directions[directions @ up.to(points) > 0.1]
-    centre, radius = _enclose(points)
     bulge, density = _explain(points, normals, centre + 4 * radius * directions)
     score = bulge + 3 * density  # wrong cameras were rarest with three
     best = score.argmax()

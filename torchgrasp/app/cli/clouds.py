@@ -57,7 +57,7 @@ class CloudCheck(Command):
         """Check the cloud and print the report; return the exit code."""
         file = self.view.read("FILE", find_cloud(self.file, "FILE"), whole=True)
         plane = as_plane(self.view.plane(file.cloud))
-        up = self.view.vertical if self.view.up is not None or plane is None else plane.normal
+        up = self.view.given_vertical(plane)
         known = plane if self.view.table is not None else None
         report = diagnose_cloud(file.cloud, up, known, stands=not self.view.no_table)
         print(format_report(report))

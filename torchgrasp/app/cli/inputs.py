@@ -114,10 +114,14 @@ class CloudOptions(ViewOptions):
             given = float((seen[:, 2] if up is None else seen.double() @ up).min())
         return given if up is None else Plane(up, given)
 
+    def given_vertical(self, plane: Plane | None) -> Tensor | None:
+        """Return the vertical of --up or of --table; None: neither is given."""
+        return self.vertical if self.up is not None or self.table is None or plane is None else plane.normal
+
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
         """Return advice on the quality of a cloud; raise `BadArgument` if no grasp should be planned on it."""
         plane = as_plane(table)
-        up = self.vertical if self.up is not None or plane is None else plane.normal
+        up = self.given_vertical(plane)
         with naming(points="CLOUD", normals="CLOUD"):
             advice = diagnose_cloud(cloud, up, plane, stands=plane is not None).advice
         for bad in advice:
