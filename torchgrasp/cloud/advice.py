@@ -11,13 +11,9 @@ from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import LAYER, find_second_body
 from torchgrasp.cloud.prepare import FACING, share_facing
-<<<<<<< HEAD
-from torchgrasp.errors import BadArgument
-=======
 from torchgrasp.cloud.support import LEAST_WIDTH, find_supports
 from torchgrasp.cloud.viewpoint import MAX_BEHIND, MAX_EDGE_ON, share_unseen
-from torchgrasp.errors import NoSupport
->>>>>>> 5f3e8be (check and cut use the one plane finder; a cloud in its camera's frame is told with --viewpoint 0 0 0; a guess says how sure it is)
+from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
@@ -65,8 +61,7 @@ def judge_view(
         advice = _judge_camera(clean, given)
     # An estimate may be on the wrong side of a table, but not where it is the origin of a camera's frame.
     trusted = eye is not None and facing >= FACING and (given or not bool(eye.any()))
-<<<<<<< HEAD
-    support = find_support(points, normals, up, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None)
+    support = _find_support(points, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None, up)
     if stands and table is not None:
         try:
             check_foot(cloud, table)
@@ -74,9 +69,6 @@ def judge_view(
             advice.append(
                 Advice(f"a table that contradicts the cloud, {error.found}", f"--table, {error.allowed}", True)
             )
-=======
-    support = _find_support(points, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None, up)
->>>>>>> 5f3e8be (check and cut use the one plane finder; a cloud in its camera's frame is told with --viewpoint 0 0 0; a guess says how sure it is)
     if stands and eye is not None and facing >= FACING:
         advice += _judge_height(points, eye, given, up, table, support)
         down = float((normals @ up < -0.5).double().mean())
