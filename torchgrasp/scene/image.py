@@ -86,17 +86,6 @@ def read_image(
     return DepthImage(z.cpu(), k.cpu(), pose)
 
 
-def read_labels(labels: Tensor | np.ndarray, shape: tuple[int, ...]) -> Int[Tensor, "..."]:
-    """Return checked labels: whole numbers >= 0 of the depth's or the cloud's shape."""
-    read = torch.as_tensor(np.asarray(labels).astype(np.int64) if isinstance(labels, np.ndarray) else labels)
-    if tuple(read.shape) != tuple(shape) or read.is_floating_point() or read.dtype == torch.bool:
-        found = f"shape {tuple(read.shape)}, {read.dtype}"
-        raise BadArgument("labels", found, f"whole numbers of shape {tuple(shape)}, one for each pixel or point")
-    if bool((read < 0).any()):
-        raise BadArgument("labels", int(read.min()), "labels >= 0; 0 is the table and all that is no object")
-    return read.long().cpu()
-
-
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
     """Return the root mean square distance [m] of each label's points from their middle."""
     label, own = labels.reshape(-1), points.reshape(-1, 3)

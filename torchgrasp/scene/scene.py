@@ -1,7 +1,8 @@
 """A scene: objects on a table, as one camera saw them; from images and clouds, from and to files."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,15 +11,14 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, Positive, checked
-from torchgrasp.cloud.depth import read_depth
 from torchgrasp.cloud.pose import check_sizes, find_plausible
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.cloud.support import find_table
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, to_upright
-from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image, read_labels
-from torchgrasp.scene.segment import label_image
+from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image
+from torchgrasp.scene.masks import label_image, read_labels, read_mask
 from torchgrasp.values import PointCloud
 
 
@@ -58,8 +58,8 @@ class Scene(Value):
         intrinsics: object,
         camera_pose: Tensor | np.ndarray | None = None,
         *,
-        mask: Tensor | np.ndarray | None = None,
-        labels: Tensor | np.ndarray | None = None,
+        mask: Tensor | np.ndarray | Sequence[Any] | Mapping[str, Any] | None = None,
+        labels: Tensor | np.ndarray | Sequence[Any] | Mapping[str, Any] | None = None,
         point: Sequence[float | int] | Tensor | np.ndarray | None = None,
         table: Plane | float | None = None,
         up: Sequence[float | int] | Tensor | np.ndarray | None = None,
@@ -74,23 +74,23 @@ class Scene(Value):
             depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in millimetres.
             intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth` takes.
             camera_pose: obj_from_camera (4, 4), rigid; None: results are in the camera's frame.
-            mask: (h, w) of bool or uint8, pixels of the target; it may be off by a few pixels.
-            labels: (h, w) of whole numbers; 0 is no object.
+            mask: (h, w), not 0 at the target, which may be off by a few pixels; or in another form of `labels`.
+            labels: (h, w) of whole numbers, 0 is no object; a picture with a colour for each object; a list of masks;
+                or COCO's run lengths.
             point: of the target: a pixel (u, v), or a point (x, y, z) [m].
             table: a plane, or its height z [m]; None: it is fitted.
             up: (3,), against gravity, for the fit; None: any direction.
             depth_unit: metres of one count of the depth, as `cloud_from_depth` takes it.
 
         Raises:
-            BadArgument: what `read_depth` refuses; mask or labels of another size; a target that is the table; a
+            BadArgument: what `cloud_from_depth` refuses; mask or labels of another size; a target that is the table; a
                 point where nothing was measured; a camera below the table; a pose or a unit that the view contradicts.
             NoSupport: no plane that objects stand on.
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")
         image = read_image(depth, intrinsics, camera_pose, depth_unit)
-        inside = None if mask is None else read_depth(depth, intrinsics, mask, depth_unit)[2]
-        inside = None if inside is None else inside.cpu()
+        inside = None if mask is None else read_mask(mask, tuple(image.depth.shape))
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points, measured = image.points(), image.depth > 0
         supports = find_plausible(points[measured], image.obj_from_camera, table, up, depth_unit is not None)

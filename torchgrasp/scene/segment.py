@@ -1,8 +1,10 @@
 """The objects in a depth image: what rises above the table, divided where the depth jumps, and merged again.
 
-Pieces are parts of one object if they nearly touch, if one stands above the footprint of the other, or if one floats
-beside the other.
+Pieces of one object touch, are over each other's footprint, make one hollow body's rim, or float beside it.
 """
+
+import itertools
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,21 +13,19 @@ from torch import Tensor
 
 from torchgrasp.cloud.sensor import fit_noise
 from torchgrasp.cloud.support import Support
-from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.scene.image import LEAST_PIXELS, DepthImage, label_radii
+from torchgrasp.scene.image import DepthImage, label_radii
 
 BAND = 0.010  # heights [m] below this, of either sign, measure the noise of the table
 LEAST_HEIGHT = 0.002  # least height [m] of an object's pixels above the table
 NEAR = 0.005  # distance [m] within which a pixel at a depth jump belongs to an object
 FEW = 6  # pieces with fewer pixels are noise
-GAP, TOUCH, FLOATING_GAP = 0.008, 3, 0.013
-"""Pieces touch where TOUCH pixels are within GAP [m]; a floating piece belongs to one within FLOATING_GAP [m]."""
+GAP, TOUCH, FAR = 0.008, 3, 0.05
+"""Pieces touch where TOUCH pixels are within GAP [m]; parts of one object are within FAR [m]."""
 OVERHANG = 0.05  # distance [m] to which an object extends beyond the visible region of its support
 VAST = 0.2  # greatest root mean square distance [m] of an object's points from their middle; a wall has more
-MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a box drawn around an object are
 
 
 def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
@@ -49,12 +49,12 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
     # A tenth of an object's pixels are 3.5 mm high and four deviations of the noise; an uneven table is not.
-    flat, whole = measured & (mean.abs() < BAND), _counts(pieces)
+    flat, whole = measured & (mean.abs() < BAND), count_labels(pieces)
     noise = fit_noise(image.depth[flat], mean[flat]).sigma(image.depth)
-    high = _counts(torch.where(mean > (4 * noise).clamp_min(0.0035), pieces, 0), len(whole)) >= 0.1 * whole
-    few = _counts(torch.where(sure, pieces, 0), len(high)) < FEW
+    high = count_labels(torch.where(mean > (4 * noise).clamp_min(0.0035), pieces, 0), len(whole)) >= 0.1 * whole
+    few = count_labels(torch.where(sure, pieces, 0), len(high)) < FEW
     over = pieces[pieces > 0][support.covers(points[pieces > 0])]
-    beside = _counts(over, len(high)) < 0.2 * whole
+    beside = count_labels(over, len(high)) < 0.2 * whole
     vast = label_radii(points, pieces) > VAST
     pieces = torch.where((few | ~high | beside | vast)[pieces], 0, pieces)
     group = _merge(smooth, torch.where(sure, pieces, 0), table, jump)
@@ -66,47 +66,6 @@ def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
     smooth = image.without_speckle()
     risen = _risen(smooth, table, *_smoothed(image, table))
     return _grown(image.points(), _core(smooth, risen)[0].long(), risen) > 0
-
-
-def label_image(
-    image: DepthImage, support: Support, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
-) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel: the given ones without table and flying pixels, or those of `segment`.
-
-    A mask becomes label 1. It loses the table and strips of neighbours. Other parts of its object just outside of it
-    belong to nothing.
-
-    Raises:
-        BadArgument: nothing but the table is left of a mask, or nothing of all labels.
-    """
-    if labels is not None:
-        kept = torch.where(on_surface(image, support.plane), labels, 0)
-        if not bool((kept > 0).any()):
-            raise BadArgument("labels", "none that rises above the table", "labels of objects on the table")
-        return kept
-    objects = segment(image, support)
-    if mask is None:
-        return objects
-    inside = mask & on_surface(image, support.plane)
-    pieces, length = torch.where(inside, objects, 0), int(objects.max()) + 1
-    whole, part = _counts(objects, length), _counts(pieces, length)
-    belongs = (part >= 0.5 * whole) | (part >= 0.3 * max(1, int(inside.sum())))
-    belongs[0] = True
-    target = inside & belongs[objects]
-    seen = int((mask & (image.depth > 0)).sum())
-    if int(target.sum()) < max(LEAST_PIXELS, MASK_SHARE * seen):
-        found = f"{int(target.sum())} of {seen} measured pixels above the table"
-        least = f"at least {LEAST_PIXELS}, and a {1 / MASK_SHARE:.0f}th: this target is the table"
-        raise BadArgument("mask", found, least)
-    from scipy.ndimage import binary_dilation
-
-    about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
-    rest = torch.where(target | (about & belongs[objects]), 0, objects)
-    few = _counts(rest, length) < LEAST_PIXELS
-    rest = torch.where(few[rest], 0, rest)
-    _, number = torch.cat([torch.zeros(1, dtype=torch.long), rest.reshape(-1)]).unique(return_inverse=True)
-    rest = number[1:].reshape(rest.shape)
-    return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0))
 
 
 def _smoothed(image: DepthImage, table: Plane) -> tuple[Tensor, Tensor]:
@@ -142,6 +101,9 @@ def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
 
 def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]:
     """Return the number of the connected component of each core pixel, from 1; 0 elsewhere."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     h, w = core.shape
     index = torch.arange(h * w).reshape(h, w)
     edges = []
@@ -150,24 +112,17 @@ def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]
         b = (slice(down, h), slice(max(0, right), w - max(0, -right)))
         joined = core[a] & core[b] & ((depth[a] - depth[b]).abs() < jump[a])
         edges.append(torch.stack([index[a][joined], index[b][joined]]))
-    number = _connected(torch.cat(edges, 1).numpy(), h * w).reshape(h, w)
-    return torch.where(core, number + 1, 0)
-
-
-def _connected(edges: np.ndarray, count: int) -> Int[Tensor, "n"]:
-    """Return the component of each of `count` nodes, given edges (2, e)."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_matrix((np.ones(edges.shape[1], dtype=bool), tuple(edges)), shape=(count, count))
-    return torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64))
+    pairs = torch.cat(edges, 1).numpy()
+    graph = coo_matrix((np.ones(pairs.shape[1], dtype=bool), tuple(pairs)), shape=(h * w, h * w))
+    number = torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64))
+    return torch.where(core, number.reshape(h, w) + 1, 0)
 
 
 def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
     """Give risen pixels without a label, pass by pass, that of the nearest labelled point within `NEAR`."""
     from scipy.spatial import KDTree
 
-    labels = torch.where((_counts(labels) < FEW)[labels], 0, labels).reshape(-1)
+    labels = torch.where((count_labels(labels) < FEW)[labels], 0, labels).reshape(-1)
     place, loose = points.reshape(-1, 3).numpy(), torch.nonzero(risen.reshape(-1) & (labels == 0))[:, 0]
     new = torch.nonzero(labels)[:, 0]
     for _ in range(12):
@@ -201,82 +156,127 @@ def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h 
     return whole
 
 
-def _counts(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
+def count_labels(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
     """Count the pixels of each label."""
     return torch.bincount(labels.reshape(-1), minlength=length)
 
 
 def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """Return labels 1, 2, ... by falling size, without objects of fewer than 40 pixels."""
-    count = _counts(labels)
+    """Return labels 1, 2, ... by falling size, without specks of fewer than 100 pixels of 640 x 480."""
+    count = count_labels(labels)
     count[0] = 0
     order = torch.argsort(count, descending=True, stable=True)
-    order = order[count[order] >= 40]
+    order = order[count[order] >= 100 * labels.numel() / (640 * 480)]
     new = torch.zeros_like(count)
     new[order] = torch.arange(1, len(order) + 1)
     return new[labels]
 
 
 def _merge(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
-    """Return the number of the object of each piece, 0 for the piece 0."""
+    """Return the number of the object of each piece, 0 for the piece 0 and for pieces of no object."""
     from scipy.spatial import KDTree
 
-    rows = pieces > 0
     new = torch.zeros(int(pieces.max()) + 1, dtype=torch.long)
-    names, number, count = pieces[rows].unique(return_inverse=True, return_counts=True)
-    large = count >= 30  # smaller pieces go to the nearest large one
-    if not bool(large.any()):
+    names, count = pieces[pieces > 0].unique(return_counts=True)
+    if not len(names):
         return new
-    place = image.points()[rows]
-    parts = [place[number == k] for k in torch.nonzero(large)[:, 0].tolist()]
-    floating = _floating(image, pieces, table, jump)[names[large]].tolist()
-    joined = _join(parts, table, floating)
-    new[names[large]] = _connected(np.array(joined, dtype=int).reshape(-1, 2).T, len(parts)) + 1
-    tree, owner = KDTree(torch.cat(parts).numpy()), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    for k in torch.nonzero(~large)[:, 0].tolist():
-        distance, index = tree.query(place[number == k].numpy(), distance_upper_bound=GAP)
-        if np.isfinite(distance).sum() >= TOUCH:
-            new[names[k]] = new[names[large]][int(owner[np.asarray(index)[distance.argmin()]])]
+    order = torch.argsort(pieces[pieces > 0], stable=True)
+    parts = [part.numpy() for part in _over_table(image, table)[pieces > 0][order].split(count.tolist())]
+    floating = _floating(image, pieces, table, jump)[names].tolist()
+    gap = _gaps([KDTree(part) for part in parts])
+    large = [k for k in range(len(parts)) if len(parts[k]) >= 30]
+    bodies = _joined([_Body((k,), parts[k]) for k in large], gap, floating)
+    for number, body in enumerate(bodies, start=1):
+        new[names[list(body.rows)]] = number
+    for k in range(len(parts)):  # smaller pieces go to the nearest large one
+        if large and k not in large and gap[k, large].min() < GAP:
+            new[names[k]] = new[names[large[int(gap[k, large].argmin())]]]
     return new
 
 
-def _join(parts: list[Tensor], table: Plane, floating: list[bool]) -> list[tuple[int, int]]:
-    """Return the pairs of pieces that are parts of one object."""
-    from scipy.spatial import KDTree
+def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> list["_Body"]:
+    """Return the bodies after joining those that are parts of one object, given the gaps [m] between pieces."""
 
-    trees: list[KDTree] = [KDTree(part.numpy()) for part in parts]
-    low, high = np.stack([tree.mins for tree in trees]), np.stack([tree.maxes for tree in trees])
-    joined: list[tuple[int, int]] = []
-    for a in range(len(parts)):
-        between = np.linalg.norm(np.maximum(0, np.maximum(low[a] - high, low - high[a])), axis=-1)
-        nearest, least = -1, FLOATING_GAP
-        for b in np.nonzero(between < FLOATING_GAP)[0].tolist():
-            if b == a:
-                continue
-            small, large = (a, b) if len(parts[a]) < len(parts[b]) else (b, a)
-            distance = trees[large].query(trees[small].data, distance_upper_bound=FLOATING_GAP)[0]
-            if distance.min() < least:
-                nearest, least = b, float(distance.min())
-            touches = (distance < GAP).sum() >= TOUCH
-            if b < a and (touches or _stand_over(parts[small], parts[large], table)):
-                joined.append((a, b))
-        if floating[a] and nearest >= 0:
-            joined.append((a, nearest))
-    return joined
+    def between(a: _Body, b: _Body) -> float:
+        return float(gap[np.ix_(a.rows, b.rows)].min())
+
+    done: list[_Body] = []
+    while bodies:
+        body = bodies.pop()
+        parts = [other for other in bodies + done if _one_body(body, other, between(body, other))][:1]
+        bodies, done = ([other for other in some if other not in parts] for some in (bodies, done))
+        (bodies if parts else done).append(sum(parts, body))
+    for body in [body for body in done if all(floating[row] for row in body.rows)]:  # the roots of a handle are hidden
+        others = [other for other in done if other is not body]
+        nearest = min(others, key=lambda other: between(body, other), default=body)
+        reach = FAR if np.ptp(body.points, 0).max() < 0.7 * np.ptp(nearest.points, 0).max() else GAP
+        if body in done and nearest is not body and between(body, nearest) < reach:
+            done = [other for other in others if other is not nearest] + [body + nearest]
+    return done
 
 
-def _stand_over(part: Float[Tensor, "n 3"], other: Float[Tensor, "m 3"], table: Plane) -> bool:
-    """Return whether a fifth of a part's points stand over the convex footprint of the other part."""
-    from scipy.spatial import ConvexHull, QhullError
-
+def _over_table(image: DepthImage, table: Plane) -> Float[Tensor, "h w 3"]:
+    """Return the points of all pixels in a frame whose z is the height above the table."""
     normal = table.normal.double()
     x = unit(torch.linalg.cross(normal, torch.eye(3, dtype=torch.float64)[int(normal.abs().argmin())]))
-    axes = torch.stack([x, torch.linalg.cross(normal, x)], -1)
+    axes, points = torch.stack([x, torch.linalg.cross(normal, x)], -1), image.points()
+    return torch.cat([points @ axes, table.height(points)[..., None]], -1)
+
+
+def _gaps(trees: list[Any]) -> np.ndarray:
+    """Return the distance [m] within which `TOUCH` points of one tree are near the other; infinity beyond `FAR`."""
+    low, high = np.stack([tree.mins for tree in trees]), np.stack([tree.maxes for tree in trees])
+    gap = np.full((len(trees), len(trees)), np.inf)
+    for a, b in itertools.combinations(range(len(trees)), 2):
+        small, large = sorted((a, b), key=lambda k: trees[k].n)
+        rows = ((trees[small].data > low[large] - FAR) & (trees[small].data < high[large] + FAR)).all(-1)
+        if rows.sum() >= TOUCH:
+            distance = trees[large].query(trees[small].data[rows], distance_upper_bound=FAR)[0]
+            gap[a, b] = gap[b, a] = np.partition(distance, TOUCH - 1)[TOUCH - 1]
+    return gap
+
+
+class _Body:
+    """Pieces of one object: their numbers, some of their points, and the convex hull of their footprint."""
+
+    def __init__(self, rows: tuple[int, ...], points: np.ndarray) -> None:
+        self.rows, self.points = rows, points[:: 1 + len(points) // 2000]
+        self.corners, self.sides = _footprint(points[:, :2])
+        self.top = float(np.quantile(self.points[:, 2], 0.98))
+
+    def __add__(self, other: "_Body") -> "_Body":
+        return _Body(self.rows + other.rows, np.concatenate([self.points, other.points]))
+
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """Return how far [m] points are inside each side of the footprint."""
+        return -(points[:, :2] @ self.sides[:, :2].T + self.sides[:, 2])
+
+
+def _footprint(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners and the sides of a convex hull; no side, if all points are on a line."""
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
-        sides = torch.from_numpy(ConvexHull((other @ axes).numpy()).equations)
-    except QhullError:  # all on a line
+        hull = ConvexHull(flat)
+    except QhullError:
+        return flat, np.array([[0.0, 0.0, 1.0]])
+    return flat[hull.vertices], hull.equations
+
+
+def _one_body(a: _Body, b: _Body, gap: float) -> bool:
+    """Return whether two bodies touch, one is over the footprint of the other, or both are parts of one rim."""
+    if gap < GAP or gap > FAR:
+        return gap < GAP
+    small, large = (a, b) if len(a.points) < len(b.points) else (b, a)
+    if float((large.depth(small.points).min(-1) > 0).mean()) > 0.6:
+        return True
+    both = np.concatenate([a.points, b.points])
+    sides = _footprint(np.concatenate([a.corners, b.corners]))[1]
+    inner = -(both[:, :2] @ sides[:, :2].T + sides[:, 2])
+    if abs(a.top - b.top) > 0.005 or gap > 0.4 * inner.max(0).min():  # two heights, or a wide gap in the rim
         return False
-    return float((part @ axes @ sides[:, :2].T + sides[:, 2] < 0).all(-1).double().mean()) > 0.2
+    high = both[:, 2] > max(a.top, b.top) - 0.004  # only a hollow body has no top in its middle
+    return float((inner[high].min(-1) > 0.012).mean()) < 0.05
 
 
 def _floating(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:

@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+import torch
+
+from torchgrasp.errors import BadArgument
+from torchgrasp.scene.masks import read_labels, read_mask
+
+LABELS = np.array([[0, 0, 2, 2], [1, 1, 0, 2], [1, 0, 0, 0]])
+SHAPE = LABELS.shape
+
+
+def run_lengths(mask):
+    """Return COCO's run lengths, column by column, from the first run of zeros."""
+    flat = np.concatenate([[False], mask.T.ravel(), [not mask.T.ravel()[-1]]])
+    edges = np.concatenate([[0], np.nonzero(flat[1:] != flat[:-1])[0]])
+    return np.diff(edges).tolist()
+
+
+def as_text(counts):
+    """Return COCO's text of run lengths."""
+    text = ""
+    for k, count in enumerate(counts):
+        value = count - counts[k - 2] if k > 2 else count
+        while True:
+            bits, value = value & 31, value >> 5
+            more = value != (-1 if bits & 16 else 0)
+            text += chr(48 + bits + 32 * more)
+            if not more:
+                break
+    return text
+
+
+def masks():
+    return [LABELS == 1, LABELS == 2]
+
+
+COLOURS = np.array([[0, 0, 0], [0, 9, 7], [200, 0, 0]], dtype=np.uint8)[LABELS]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        *(LABELS.astype(kind) for kind in (np.uint8, np.uint16, np.int32, np.uint32, np.float32)),
+        torch.from_numpy(LABELS)[..., None],
+        COLOURS,
+        np.concatenate([COLOURS, np.full((*SHAPE, 1), 255, dtype=np.uint8)], -1),
+        masks(),
+        torch.from_numpy(np.stack(masks()))[:, None],
+        [{"segmentation": mask, "area": int(mask.sum())} for mask in masks()],
+        [{"size": list(SHAPE), "counts": run_lengths(mask)} for mask in masks()],
+        [{"size": list(SHAPE), "counts": as_text(run_lengths(mask)).encode()} for mask in masks()],
+    ],
+)
+def test_every_form_of_labels_is_the_same(given):
+    assert torch.equal(read_labels(given, SHAPE), torch.from_numpy(LABELS))
+
+
+def test_long_run_lengths_as_text_are_those_as_numbers():
+    mask = np.random.default_rng(0).uniform(size=(480, 640)) > 0.999
+    mask[100:300, 200:400] = True
+    found = read_mask({"size": [480, 640], "counts": as_text(run_lengths(mask))}, mask.shape)
+    assert torch.equal(found, torch.from_numpy(mask))
+
+
+def test_a_small_mask_lies_above_a_large_one():
+    large = np.ones(SHAPE, dtype=bool)
+    for given in ([LABELS == 1, large], [large, LABELS == 1]):
+        assert len(read_labels(given, SHAPE).unique()) == 2
+
+
+def test_a_transparent_picture_has_no_object_there():
+    picture = np.full((*SHAPE, 4), 255, dtype=np.uint8)
+    picture[..., 3] = 255 * (LABELS == 2)
+    assert torch.equal(read_mask(picture, SHAPE), torch.from_numpy(LABELS == 2))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (LABELS, "2 values beside 0"),
+        (np.zeros(SHAPE), "no pixel inside"),
+        (0.5 * (LABELS == 1), "whole numbers"),
+        (-LABELS, "got -2"),
+        (np.ones((4, 3), bool), "got shape"),
+        ("mask", "whole numbers"),
+        ({"size": [4, 3], "counts": [12]}, "run lengths"),
+        ({"size": list(SHAPE), "counts": [1, 2]}, "run lengths"),
+        ({"size": list(SHAPE), "counts": "\x7f"}, "run lengths"),
+        ({"counts": [12]}, "run lengths"),
+    ],
+)
+def test_a_bad_mask_is_one_sentence(given, message):
+    with pytest.raises(BadArgument, match=message) as refused:
+        read_mask(given, SHAPE)
+    assert "\n" not in str(refused.value)

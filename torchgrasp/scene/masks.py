@@ -1,0 +1,158 @@
+"""Masks and labels of objects from other tools: images, lists of masks, and COCO's run lengths."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchgrasp.cloud.support import Support
+from torchgrasp.errors import BadArgument
+from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
+from torchgrasp.scene.segment import count_labels, on_surface, segment
+
+MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a box drawn around an object are
+
+
+def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> Int[Tensor, "..."]:
+    """Return checked labels of the depth's or the cloud's shape: whole numbers >= 0, where 0 is no object.
+
+    Args:
+        labels: numbers of the shape, of any type, or with one channel more; a picture (h, w, 3 or 4) with a colour for
+            each object, where black and transparent are none; a list of masks, where the smaller lies above the larger;
+            a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its "segmentation".
+        shape: of the depth (h, w), or of the cloud (n,).
+        name: of the argument, in errors.
+
+    Raises:
+        BadArgument: another shape, negative or broken numbers, or run lengths of another size.
+
+    >>> read_labels({"size": [2, 3], "counts": [1, 2, 3]}, (2, 3))
+    tensor([[0, 1, 0],
+            [1, 0, 0]])
+    """
+    if isinstance(labels, Mapping):
+        if "segmentation" in labels:
+            return read_labels(labels["segmentation"], shape, name)
+        return _runs(labels, shape, name).long()
+    whole = f"whole numbers of shape {tuple(shape)}, one for each pixel or point"
+    if isinstance(labels, Sequence) and len(labels) and (isinstance(labels[0], Mapping) or np.ndim(labels[0]) >= 2):
+        return _stacked([read_labels(mask, shape, name) for mask in labels])
+    try:
+        read = labels.detach().cpu().numpy() if isinstance(labels, Tensor) else np.asarray(labels)
+        numbers = read.astype(np.int64)
+        exact = bool((numbers == read).all())
+    except (TypeError, ValueError, OverflowError) as error:
+        raise BadArgument(name, type(labels).__name__, whole) from error
+    if read.shape == (*shape, 1):
+        read, numbers = read[..., 0], numbers[..., 0]
+    if len(shape) == 2 and read.shape in ((*shape, 3), (*shape, 4)) and exact:
+        colour = numbers[..., :3] * (numbers[..., 3:] > 0) if read.shape[-1] == 4 else numbers
+        packed = torch.from_numpy(np.abs(colour) @ np.array([1 << 32, 1 << 16, 1]))
+        return torch.cat([packed.new_zeros(1), packed.reshape(-1)]).unique(return_inverse=True)[1][1:].reshape(shape)
+    if len(shape) == 2 and read.ndim > 2 and read.size and read.shape in ((len(read), *shape), (len(read), 1, *shape)):
+        return _stacked([read_labels(mask.reshape(shape), shape, name) for mask in read])
+    if read.shape != tuple(shape) or not exact:
+        raise BadArgument(name, f"shape {read.shape}, {read.dtype}", whole)
+    if (numbers < 0).any():
+        raise BadArgument(name, int(numbers.min()), "labels >= 0; 0 is the table and all that is no object")
+    return torch.from_numpy(numbers)
+
+
+def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
+    """Return the mask of one object, in any form of `read_labels`.
+
+    Raises:
+        BadArgument: as `read_labels`; no pixel inside; several objects.
+    """
+    labels = read_labels(mask, shape, "mask")
+    found = labels[labels > 0].unique()
+    if not len(found):
+        raise BadArgument("mask", "no pixel inside", "a mask that is not 0 at the object's pixels")
+    if len(found) > 1:
+        raise BadArgument("mask", f"{len(found)} values beside 0", "one object; give several objects as labels")
+    return labels > 0
+
+
+def _stacked(masks: list[Int[Tensor, "h w"]]) -> Int[Tensor, "h w"]:
+    """Return the labels 1, 2, ... of masks, the smaller above the larger."""
+    labels = torch.zeros_like(masks[0])
+    for k in sorted(range(len(masks)), key=lambda k: -int((masks[k] > 0).sum())):
+        labels[masks[k] > 0] = k + 1
+    return labels
+
+
+def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Tensor, "h w"]:
+    """Return the mask of COCO's run lengths, column by column, as numbers or as text."""
+    allowed = f'a dict with "size" {list(shape)} and "counts", whose sum is {int(np.prod(shape))}'
+    try:
+        size, counts = [int(side) for side in mask["size"]], mask["counts"]
+        if isinstance(counts, str | bytes):
+            counts = _run_lengths(counts.encode("ascii") if isinstance(counts, str) else counts)
+        runs = np.asarray(counts, dtype=np.int64)
+        if size != list(shape) or (runs < 0).any() or runs.sum() != np.prod(shape):
+            raise ValueError(f"size {size}, sum {runs.sum()}")
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
+        raise BadArgument(name, f"{type(error).__name__} ({error}) in run lengths", allowed) from error
+    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    return torch.from_numpy(flat.reshape(shape[::-1]).T.copy())
+
+
+def _run_lengths(text: bytes) -> list[int]:
+    """Return the run lengths in COCO's text: 5 bits a letter, each after the third relative to the last but one."""
+    runs: list[int] = []
+    value = shift = 0
+    for letter in text:
+        bits = letter - 48
+        if not 0 <= bits < 64 or shift > 35:
+            raise ValueError("a letter that is no run length")
+        value |= (bits & 31) << shift
+        shift += 5
+        if not bits & 32:
+            value -= (1 << shift) if bits & 16 else 0
+            runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+            value = shift = 0
+    return runs
+
+
+def label_image(
+    image: DepthImage, support: Support, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
+) -> Int[Tensor, "h w"]:
+    """Return the label of each pixel: the given ones without table and flying pixels, or those of `segment`.
+
+    A mask becomes label 1. It loses the table and strips of neighbours. Other parts of its object just outside of it
+    belong to nothing.
+
+    Raises:
+        BadArgument: nothing but the table is left of a mask, or nothing of all labels.
+    """
+    if labels is not None:
+        kept = torch.where(on_surface(image, support.plane), labels, 0)
+        if not bool((kept > 0).any()):
+            raise BadArgument("labels", "none that rises above the table", "labels of objects on the table")
+        return kept
+    objects = segment(image, support)
+    if mask is None:
+        return objects
+    inside = mask & on_surface(image, support.plane)
+    pieces, length = torch.where(inside, objects, 0), int(objects.max()) + 1
+    whole, part = count_labels(objects, length), count_labels(pieces, length)
+    belongs = (part >= 0.5 * whole) | (part >= 0.3 * max(1, int(inside.sum())))
+    belongs[0] = True
+    target = inside & belongs[objects]
+    seen = int((mask & (image.depth > 0)).sum())
+    if int(target.sum()) < max(LEAST_PIXELS, MASK_SHARE * seen):
+        found = f"{int(target.sum())} of {seen} measured pixels above the table"
+        least = f"at least {LEAST_PIXELS}, and a {1 / MASK_SHARE:.0f}th: this target is the table"
+        raise BadArgument("mask", found, least)
+    from scipy.ndimage import binary_dilation
+
+    about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
+    rest = torch.where(target | (about & belongs[objects]), 0, objects)
+    few = count_labels(rest, length) < LEAST_PIXELS
+    rest = torch.where(few[rest], 0, rest)
+    _, number = torch.cat([torch.zeros(1, dtype=torch.long), rest.reshape(-1)]).unique(return_inverse=True)
+    rest = number[1:].reshape(rest.shape)
+    return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0))
