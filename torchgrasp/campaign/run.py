@@ -82,7 +82,7 @@ def run_campaign(
         objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every machine.
         hand: from `load_hand`, with the fingers that grasp.
         folder: folder of the data set; no other run may write to it at the same time.
-        spec: what is planned and tried; None: `CampaignSpec()`.
+        spec: options of the campaign; None: `CampaignSpec()`.
         workers: processes here, 0: this one; or the address of a Dask scheduler, as "tcp://10.0.0.1:8786", whose
             workers have one thread each.
         observer: called with the row of each finished job.

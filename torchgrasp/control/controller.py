@@ -143,7 +143,7 @@ class GraspController:
         return self.targets
 
     def _approach(self, guard: GuardedApproach, observation: Observation, period: float) -> Targets:
-        """Return the targets of the approaching hand; at its end tell the closing where touches located the object."""
+        """Return the targets of the approaching hand; at its end pass the object pose found by touch to the closing."""
         guard(observation, period)
         if guard.done:
             self.guard, self.stops = None, guard.stops

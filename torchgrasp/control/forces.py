@@ -54,7 +54,7 @@ def squeeze(
 
     Args:
         hand: the hand; it follows the grasps to their device.
-        grasps: g rows, planned for this hand.
+        grasps: g grasps, planned for this hand.
         force: normal force of the strongest finger [N].
         kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
 
@@ -99,7 +99,7 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return the joint targets with which drives of a given stiffness [N m/rad] exert fingertip forces [N]."""
+    """Return joint targets, forces and torques with which drives of a stiffness [N m/rad] exert given forces [N]."""
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
 

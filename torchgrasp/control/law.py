@@ -110,8 +110,8 @@ def joint_step(
 ) -> Float[Tensor, "*b h"]:
     """Return the change of the joints [rad] in one tick, Eq. (25), by damped least squares over all fingers.
 
-    Coupled fingers and fingers with few joints have no J^-1, as the paper has. In the null space of the Jacobian the
-    joints move towards the planned posture: `posture_error` [rad] is the planned minus the present joints.
+    The paper's J^-1 does not exist for coupled fingers or few joints. In the null space of the Jacobian the joints move
+    towards the planned posture: `posture_error` [rad] is the planned minus the present joints.
     """
     stacked = jacobian.flatten(-3, -2)
     inverse_jacobian = damped_inverse(stacked, damping)

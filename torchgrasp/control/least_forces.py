@@ -69,7 +69,7 @@ class LeastForces:
     ) -> Float[Array, "f 3"]:
         """Return forces [N] that carry the load, within the friction cones, with normal forces above `floor` [N].
 
-        If no forces within the cones are found, the friction is raised to the least value that was found.
+        If no forces within the cones are found, the friction is raised to the least at which forces were found.
         """
         count = len(normals)
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], self._normal(normals)])
@@ -129,7 +129,7 @@ class _Barrier:
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
-        """Return the best of several initial guesses; raise the friction and lower the floors if none is feasible."""
+        """Return the best of several initial guesses; if none is feasible, raise the friction and lower the floors."""
         push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
         across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
         ratio = np.where(push > 0, across / np.maximum(push, 1e-12), np.inf).max(-1)

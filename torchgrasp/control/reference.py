@@ -101,14 +101,14 @@ class ClosingReference(Value):
 
         Args:
             hand: the hand.
-            grasp: one row, planned for the hand.
+            grasp: a single grasp, planned for the hand.
             force: normal force of the strongest finger [N].
             kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
             stability: model that chooses among balanced forces of nearly equal friction, and gives their covariance;
                 None: the covariance grows with the force.
 
         Raises:
-            BadArgument: not exactly one row, joints or fingers of another hand, a force or stiffness that is not
+            BadArgument: not exactly one grasp, joints or fingers of another hand, a force or stiffness that is not
                 positive, joints beyond their limits, or numbers in the grasp that are not finite.
         """
         check_single(grasp)

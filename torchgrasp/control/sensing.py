@@ -102,7 +102,7 @@ def _pushes(reference: ClosingReference, forces: Float[Tensor, "f 3"]) -> TipCon
 
 
 class DriveFeel:
-    """Estimate contact forces from the drives alone: a blocked joint does not reach its target.
+    """Estimate contact forces only from the joint drives: a blocked joint does not reach its target.
 
     A drive of stiffness k and damping d exerts k (target - q) - d dq/dt.
     """

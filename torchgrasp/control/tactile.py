@@ -52,7 +52,7 @@ class TactileState(Value):
         reading: normal force [N].
         forces: full force on the object [N].
         contact: whether the fingertip touches.
-        points, normals: place [m] and outward normal of the contact; NaN without contact.
+        points, normals: position [m] and outward normal of the contact; NaN without contact.
         lagged: low-passed normal force [N], full force [N] and sliding speed [m/s].
         average: low-passed normal force [N] that sets the contact flag.
         sliding: sliding speed [m/s].
@@ -101,7 +101,7 @@ def measure(
     Args:
         tactile: the state at the last tick.
         truth: true contacts during the tick.
-        pads: outward surface normals at the planned contacts: the direction of the noise of a tip in the air.
+        pads: outward surface normals at the planned contacts, for the noise of tips that touch nothing.
         radius: radius of the tips [m]; 0: not round, 12 mm is assumed.
         period: period of the tick [s].
         generator: draws the noise; None: no noise.

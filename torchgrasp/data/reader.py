@@ -42,7 +42,7 @@ class GraspShards:
     `len` counts the grasps. Item i is a dict of float32 tensors [m, rad] in the object's frame: `points` (n, 3) and
     `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach` (3,), `obj_from_hand` (4, 4); `contacts` and
     `normals` (f, 3), `std_m` (f,); `margin` and `witness` (6,) of the certificate; `clearance`; `predicted` success;
-    `simulated`, the share of tries that passed. `closed` is a bool, `job` the index in `jobs`.
+    `simulated`, the fraction of simulated trials that passed. `closed` is a bool, `job` the index in `jobs`.
 
     Args:
         folder: folder of the data set.

@@ -67,7 +67,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Pull in each direction, each in a fresh scene, until a pull fails."""
+    """Pull at the grasped object in each direction, each in a fresh scene, until a pull fails."""
     started = time.process_time()
     status, largest, force, tried = Status.OK, np.zeros(2), math.nan, 0
     while status is Status.OK and tried < len(DIRECTIONS):

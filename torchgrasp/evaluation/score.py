@@ -35,7 +35,7 @@ STAGES: dict[str, tuple[Status, ...]] = {
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of one trial: the grasp of a `rank`, under pose error number `draw`; NaN: not measured.
+    """The outcome of one trial of the grasp at `rank`, with the pose error of number `draw`; NaN: not measured.
 
     Args:
         moved: motion of the object [m]; in a lift relative to the hand.
@@ -99,12 +99,14 @@ class ViewScore(Value):
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     """Return the numbers of an evaluation by name; intervals are over families of objects.
 
-    * "gsr": grasp success rate, the fraction of trials that passed. * "top1": fraction of best-ranked grasps that
-    passed; a view without grasps counts as failed. * "objects": fraction of objects with a success. "refused": number
-    of views without a grasp. * "by_object", "by_group": the same numbers for each object or group. * "failures": counts
-    of statuses by stage. "fingers": counts of views by the grasping fingers. * "force_n", "overlap_mm", "plan_cpu_s",
-    "trial_cpu_s": means. "cpu_s": total. * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps. *
-    "success": calibration of the predictions (`judge`), or None.
+    * "gsr": grasp success rate, the fraction of trials that passed.
+    * "top1": fraction of best-ranked grasps that passed; a view without grasps counts as failed.
+    * "objects": fraction of objects with a success. "refused": number of views without a grasp.
+    * "by_object", "by_group": the same numbers for each object or group.
+    * "failures": counts of statuses by stage. "fingers": counts of views by the grasping fingers.
+    * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
+    * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
+    * "success": calibration of the predictions (`judge`), or None.
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)

@@ -1,7 +1,7 @@
 """Rigid transforms, and the virtual frame of three contacts (Eqs. 15-17).
 
-A transform `a_from_b` maps coordinates of frame b into frame a. Products therefore chain adjacent names: `obj_from_hand
-= obj_from_vf @ vf_from_hand` (Eq. 24).
+A transform `a_from_b` maps coordinates of frame b into frame a. Products therefore chain adjacent names:
+`obj_from_hand = obj_from_vf @ vf_from_hand` (Eq. 24).
 """
 
 import itertools

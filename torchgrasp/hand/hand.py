@@ -143,7 +143,7 @@ class Hand(Value):
 
     @checked
     def require_three(self, argument: str, what: str) -> None:
-        """Raise `BadArgument` unless the hand has three fingertips, as in the paper; `argument` is the one to blame."""
+        """Raise `BadArgument` about an argument unless the hand has three fingertips, as in the paper."""
         if len(self.tips) != 3:
             raise BadArgument(argument, f"{what} for {len(self.tips)} fingertips", "three fingertips, as in the paper")
 

@@ -131,7 +131,7 @@ def _digest(spec: HandSpec, urdf: Urdf) -> str:
 
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:
-    """Raise `HandFileError` for names that the URDF lacks, and for parked joints that grasp, lead or follow."""
+    """Raise `HandFileError` for names that the URDF lacks, and for parked joints that also grasp or are coupled."""
     movable, links = {j.name for j in urdf.movable}, {x.name for x in urdf.links}
     if spec.base_link != urdf.root:
         raise spec.wrong(f"base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r} as base_link")

@@ -116,7 +116,7 @@ class SelfCollision(Value):
     def _near(
         self, frames: Float[Tensor, "3 4 l n"], below: float
     ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"]]:
-        """Return placed shapes, separations of bounding spheres, and pair and posture of separations below `below`."""
+        """Return the placed shapes, the separations of bounding spheres, and the pairs and postures below `below`."""
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding, distance)

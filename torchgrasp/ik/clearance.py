@@ -53,7 +53,7 @@ class Obstacles(Value):
     @classmethod
     @checked
     def of(cls, occupancy: Occupancy, full: float = 0.3, hard: bool = True) -> "Obstacles | None":
-        """Return the obstacles of an occupancy grid; None if the whole grid is free.
+        """Return the obstacles of an occupancy grid: voxels of probability `full` or more are occupied. None: all free.
 
         Raises:
             BadArgument: `full` outside [0.01, 1].

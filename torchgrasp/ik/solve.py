@@ -78,9 +78,8 @@ def solve_ik(
         library: the hand's random postures; None: drawn when they are needed.
 
     Returns:
-        The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of its contact and inside
-            its pad's
-        cone, and every link is clear.
+        The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of its contact and
+        inside its pad's cone, and every link is clear.
 
     Raises:
         BadArgument: contacts that are not finite, or not one for each fingertip; a mixture of another hand, an unknown

@@ -152,7 +152,7 @@ def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "
     Args:
         points: contacts, in any unit.
         normals: outward unit normals.
-        preferred: normal forces.
+        preferred: preferred normal forces.
         slack: tangent of the cones beyond the ratio needed. More slack gives forces nearer to the preferred ones.
 
     Returns:

@@ -1,10 +1,10 @@
 """The contact planning problem, Eqs. (10)-(14), for a batch of contacts.
 
-Unknowns x of a row are its f normalised points (f, 3) and a tension for each of the p pairs of points. Eq. (11) defines
-the normals. Eq. (13) asks for balanced forces in the friction cones. Three forces balance if and only if each is the
-sum of the pulls along the two sides at its contact [1]. Pulls between all pairs balance at more contacts, too, and
-give every balance unless the contacts lie in one plane. So W phi = 0 holds whatever the tensions; one inequality for
-each cone is left. Every inequality is a bound <= 0.
+Unknowns x of a contact set are its f normalised points (f, 3) and a tension for each of the p pairs of points. Eq. (11)
+defines the normals. Eq. (13) asks for balanced forces in the friction cones. Three forces balance if and only if each
+is the sum of the pulls along the two sides at its contact [1]. Pulls between all pairs balance at more contacts, too,
+and give every balance unless the contacts lie in one plane. So W phi = 0 holds whatever the tensions; one inequality
+for each cone is left. Every inequality is a bound <= 0.
 
 [1] Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991.
 """

@@ -150,7 +150,7 @@ def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a u"]) -> Floa
 
 
 def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage) -> State:
-    """Return the contacts after one solver stage."""
+    """Run one solver stage; return the contacts after it."""
     return levenberg_marquardt(Descent(shape, problem, stage), state, stage.steps)[0]
 
 

@@ -161,7 +161,7 @@ def candidate_rows(
     starts: int,
     generator: torch.Generator,
 ) -> tuple[Vectors, int]:
-    """Return random sets of candidate contacts, closed and well separated if possible, and the number that are."""
+    """Return random sets of candidate contacts, closed and well separated if possible, and how many are closed."""
     rows, missing, f = [], starts, problem.fingertips
     for _ in range(ROUNDS):
         choice = torch.randint(len(points), (DRAWN_PER_START * starts, f), generator=generator).to(points.device)

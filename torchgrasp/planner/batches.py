@@ -76,7 +76,7 @@ class Planner:
         self.unfinished, self.unsolved = (list[tuple[SeededContacts, Grasps]]() for _ in range(2))
 
     def run(self, deadline: float) -> Iterator[Grasps]:
-        """Yield the grasps of each batch in the upright frame, executable ones first; `meta` counts the starts so far.
+        """Yield the grasps of each batch in the upright frame, executable ones first; `meta` counts the guesses so far.
 
         No batch begins after `deadline`, a time of `time.monotonic`.
         """

@@ -38,7 +38,7 @@ def _with(request: Request, **fields: Any) -> Request:
 
 
 def list_changes(request: Request) -> list[Change]:
-    """Return every single change of a request that could give grasps, except more starts."""
+    """Return every single change of a request that could give grasps, except the change to more initial guesses."""
     kinds = (_surroundings, _fingers, _limits, _friction, _hands)
     return [change for kind in kinds for change in kind(request)]
 

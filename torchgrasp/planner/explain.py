@@ -172,14 +172,15 @@ def explain_empty(
 ) -> Explanation:
     """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
 
-    Each change is planned with the same seed and at most 100 starts: other fingers, another shipped hand, wider limits
-    of contacts, higher friction, no table, no neighbours, an arm that reaches everything. At most eight changes are
-    tried, in the order of the losses that they could prevent. The search ends at a change that the user can choose and
-    whose 20 best grasps are likely to succeed. If no change helps, more starts are tried.
+    Each change is planned with the same seed and at most 100 initial guesses: other fingers, another shipped hand,
+    wider limits of contacts, higher friction, no table, no neighbours, an arm that reaches everything. At most eight
+    changes are tried, in the order of the losses that they could prevent. The search ends at a change that the user can
+    choose and whose 20 best grasps are likely to succeed. If no change helps, more initial guesses are tried.
 
     Args:
         cloud, hand, spec, starts, seed: as in `plan_grasps`.
-        options: the further arguments of `plan_grasps`. The `observer` hears "change" with the `Trial` of each change.
+        options: the further arguments of `plan_grasps`. The `observer` is called with "change" and the `Trial` of each
+            change.
 
     Returns:
         The explanation; `print` shows it.

@@ -77,15 +77,15 @@ def plan_grasps(
 
     Args:
         cloud: points that a camera saw [m]; missing normals and viewpoint are estimated. Or a `Scene` with a target. A
-            sequence of clouds gives a list of results. The grasps of a bad cloud are none, and `meta["refused"]` holds
-            the reason.
+            sequence of clouds gives a list of results. A bad cloud gives no grasps, and `meta["refused"]` holds the
+            reason.
         hand: from `load_hand`; it is moved to the device of the cloud.
         spec: the constraints on contacts; each finger gets one contact. None: `ContactSpec()`, in mode "paper"
             `ContactSpec.paper()`.
-        starts: random initial guesses of the contact planner.
+        starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
         time_budget: wall time [s]. No batch begins after it, so the result depends on the machine. `meta["starts"]`
-            counts the starts that were planned. None: all.
+            is the number of initial guesses that were planned. None: no limit.
         workers: processes for a sequence of clouds; 0: this process.
         fingers: the fingers that grasp, as in `load_hand`; None: the fingers of `hand`. "auto": of the sets that the
             hand declares, the set with the greatest expected success. `hand_of` loads the hand of the result.
@@ -138,7 +138,7 @@ def stream_grasps(
         cloud: this and all other arguments: see `plan_grasps`.
 
     Returns:
-        An iterator over `Grasps` of at least one row each. A later batch may have a better best grasp.
+        An iterator over `Grasps` of at least one grasp each. A later batch may have a better best grasp.
 
     Raises:
         BadArgument: as `plan_grasps`; for a wrong cloud it is raised at the first iteration.
@@ -168,7 +168,7 @@ def _stream(request: Request) -> Iterator[Grasps]:
 
 
 def _finish(request: Request, batches: list[Grasps]) -> Grasps:
-    """Return the grasps of all batches together, and report them."""
+    """Rank the grasps of all batches together, report them to the observer, and return them."""
     grasps = rank_together(batches, request.order)
     request.observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
     return grasps

@@ -171,7 +171,7 @@ class Problem:
 
     @cached_property
     def flat(self) -> Settled:
-        """The constraints on contacts with the radius of flatness, and the candidate contacts on flat surface."""
+        """The contact constraints with a chosen radius of flatness, and the candidate contacts on flat surface."""
         spec = dataclasses.replace(self.given_spec, table=None if self.given_spec.table is None else 0.0)
         tips = self.hand.tips
         spec = dataclasses.replace(spec.for_fingertips(float(tips.radius.max())), fingertips=len(tips))

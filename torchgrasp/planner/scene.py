@@ -85,7 +85,7 @@ def plan_scene(
         scene: objects on a table.
         hand: from `load_hand`.
         spec: the constraints on contacts; None: `ContactSpec()`.
-        starts: random initial guesses of the contact planner for each object.
+        starts: number of random initial guesses of the contact planner for each object.
         seed: random seed.
         fingers: see `plan_grasps`; "auto" chooses fingers for each object. `hand_of` loads the hand of grasps.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.

@@ -208,7 +208,7 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
 
 
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
-    """Return m initial components, the clusters of k-means; raises `BadArgument` for fewer different rows."""
+    """Return m initial components, the clusters of k-means; raises `BadArgument` for fewer than m distinct rows."""
     rounds = 10  # rounds of Lloyd's algorithm: EM follows, so the clusters need not converge
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)

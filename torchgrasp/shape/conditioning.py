@@ -101,8 +101,8 @@ def select_points(
     Args:
         candidates: points on the surface, all with normals.
         known: observations that are already made, such as points inside and outside.
-        criterion: what makes a point informative: "variance", its posterior variance; greatest |mean distance|
-            ("error"); |mean| + 2 sqrt(variance) ("both").
+        criterion: the measure of information: posterior variance ("variance"), |mean distance| ("error"), or |mean
+            distance| + 2 sqrt(variance) ("both").
         stop: the selection ends when no candidate has a greater variance.
     """
     x, start = candidates.x, posterior_given(known, kernel)

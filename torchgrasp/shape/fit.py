@@ -63,8 +63,8 @@ def fit_shape(
 ) -> ShapeGP:
     """Return the Gaussian process posterior of an object's shape, given a partial point cloud, Eqs. (2)-(9).
 
-    With `support` "camera" the cloud is cleaned and signed distances are in metric proportion. The object's outline and
-    the mirrored cloud are added as noisier observations. The shape is kept out of free space and of the table.
+    With `support` "camera" the cloud is cleaned and signed distances are true to scale. The object's outline and the
+    mirrored cloud are added as noisier observations. The shape is kept out of free space and of the table.
 
     With "paper" the cloud's centre is observed at d = -1, and 20 random points around it at d = +1.
 

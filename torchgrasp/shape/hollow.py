@@ -130,7 +130,7 @@ class HollowShape(ShapeGP):
     def _by_wall(
         self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], tuple[Any, ...]]
     ) -> tuple[Tensor, ...]:
-        """Evaluate each wall at the points where it is the surface, and merge the results."""
+        """Evaluate each wall of the vessel at the points where it is the surface, and merge the results."""
         owner = self.wall_at(x)
         found: tuple[Tensor, ...] = ()
         for wall, own in zip(self.walls, owner.T, strict=True):
@@ -142,7 +142,7 @@ class HollowShape(ShapeGP):
 
 
 def _fields(jet: MeanJet) -> tuple[Tensor, ...]:
-    """Return the fields in their order."""
+    """Return the values of a jet's fields, in order."""
     return tuple(getattr(jet, f.name) for f in dataclasses.fields(jet))
 
 
@@ -152,7 +152,7 @@ class Middle(Value):
 
     Args:
         x: the points.
-        side: points where the wall is exactly as thick as `thickness`; elsewhere it is at least as thick.
+        side: mask of the points where the wall is exactly as thick as `thickness`; elsewhere it is at least as thick.
         thickness: thickness of the wall, normalised.
     """
 

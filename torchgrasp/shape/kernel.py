@@ -34,7 +34,7 @@ class Kernel:
         profile: k(r).
         diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it is a covariance
             everywhere.
-        remedy: the fix that the error suggests when the covariance is not positive definite.
+        remedy: fix that the error suggests if the covariance is not positive definite.
         closed_form: a faster `differentiate` of this profile, called with `r` and `count`; None: autograd.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))

@@ -56,8 +56,8 @@ class Support(Value):
         normal_noise: standard deviation of the cloud's normals.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
         parts: observed points of the outline and of the hidden side.
-        free: points of free space and least distances there, normalised; None: not used.
-        rows: the points of the cloud that lie on this surface; None: all.
+        free: points in free space and least signed distances there, normalised; None: not used.
+        rows: mask of the cloud's points that lie on this surface; None: all points.
         kind: see `ShapeGP`.
     """
 

@@ -89,7 +89,7 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
     points, directions = map_points(frames, contacts), map_directions(frames, normals)
 
     def share(tips: tuple[int, ...]) -> float:
-        """Return the share of the postures in which all these pads face their middle."""
+        """Return the fraction of the postures in which all these pads face their middle."""
         inward = points[:, tips].mean(1, keepdim=True) - points[:, tips]
         length = torch.linalg.vector_norm(inward, dim=0)
         facing = (directions[:, tips] * inward).sum(0) / length.clamp_min(1e-9)

@@ -40,7 +40,7 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
         mesh: the true object [m], in the frame of the grasp, where z is up.
         hand: the hand that closed.
         closure: the result of the closing.
-        direction: from the object to the camera.
+        direction: direction from the object to the camera.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -160,7 +160,7 @@ def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[
 
 
 def _list_plots(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> list[tuple[str, float, list[Any]]]:
-    """Return title, upper end of the axis, and lines of each plot."""
+    """Return title, upper end of the axis, and lines of each plot in the film strip."""
     trace, names, order = closure.trace, hand.tips.names, closure.contact_order
     ranks = [f"{order.index(k) + 1}. {name}" if k in order else f"never: {name}" for k, name in enumerate(names)]
     distance, turn = moved_in_hand(closure, _centre(mesh))

@@ -34,7 +34,7 @@ AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.4
 class SymmetryScorer:
     """Scores mirror planes: compares mirrored `probes` with the cloud, its outlines and the table.
 
-    `upright` means that all planes are parallel to z: the vertical, or the axis of a body of revolution.
+    `upright` means that all planes are parallel to z: the vertical direction, or the axis of a body of revolution.
     """
 
     points: Tensor
@@ -232,7 +232,7 @@ def _across_plane(
     grid: Float[Tensor, "d k 4"],
     across: Float[Tensor, "3"] | None,
 ) -> Float[Tensor, "p 4"]:
-    """Return the best plane that faces the view, unless there is one; none if all violate free space."""
+    """Return the best plane that faces the view, if `planes` has no such plane; none if all violate free space."""
     if across is None or any(abs(float(plane[:3] @ across)) > FACING for plane in planes):
         return grid.new_zeros(0, 4)
     found = _best_plane(scorer, grid[(grid[:, 0, :3] @ across).abs() > FACING].reshape(-1, 4), -math.inf)
