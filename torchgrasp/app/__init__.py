@@ -1,1 +1,1 @@
-"""Applications of the library: command line, reports, authoring of new hands."""
+"""Applications of the library: command line, reports, authoring of new hands. Not public."""

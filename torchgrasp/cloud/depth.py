@@ -161,7 +161,7 @@ def _read_forms(value: object) -> tuple[Any, list[float] | None, float | None]:
         found = f"a {type(value).__name__} of {', '.join(str(name)[:20] for name in list(named)[:8]) or 'nothing'}"
         allowed = "fx, fy, cx and cy, or a matrix K; of a file of many images, the entry of this image"
         raise BadArgument("intrinsics", found, allowed)
-    if key == "intrinsic_matrix" and np.ndim(inner) == 1 and len(inner) == 9 and inner[2] == inner[5] == 0:
+    if key == "intrinsic_matrix" and isinstance(inner, list) and len(inner) == 9 and inner[2] == inner[5] == 0:
         inner = [inner[i::3] for i in range(3)]  # Open3D writes column by column
     width, height = (named.get(name, named.get(f"image_{name}")) for name in ("width", "height"))
     scale = named.get("depth_scale")

@@ -178,6 +178,13 @@ def list_views(
 
     Raises:
         DatasetError: no manifest, none of the objects in it, or a bad entry.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> list_views(folder / "objects")
+    [('carton', 'view0')]
     """
     entries = {name: _parse_entry(name, field) for name, field in sorted(_read_fields(objects, only).items())}
     return [(name, view) for name, x in entries.items() for view in x.list_views(whole, most)]
@@ -190,6 +197,13 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
     Raises:
         DatasetError: as `read_entry`, or no such view.
         CloudFileError: a bad file.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> len(read_view(folder / "objects", "carton", "view0"))
+    1000
     """
     entry = read_entry(objects, name)
     if view == WHOLE:
@@ -204,7 +218,15 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
 
 @checked
 def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
-    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`."""
+    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`.
+
+    >>> import tempfile, trimesh
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.stl")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> round(float(read_object_mesh(folder / "objects", "carton").volume), 6)
+    0.00036
+    """
     scale = read_entry(objects, name).scale
     return read_mesh(_file(objects, name, "mesh.ply")).apply_scale(scale)
 

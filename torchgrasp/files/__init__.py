@@ -1,4 +1,4 @@
-"""Files: written completely or not at all, in locked folders, and read within limits.
+"""Files: written completely or not at all, in locked folders, and read within limits. Not public.
 
 No file is pickled: a file from a stranger may be malformed, but it cannot run code.
 """

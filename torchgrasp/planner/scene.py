@@ -129,7 +129,7 @@ def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
     assert scene.target is not None
     stages: dict[str, Any] = {}
 
-    def note(stage: str, message: str, value: object) -> None:
+    def note(stage: str, message: str, value: Any) -> None:
         stages[stage] = value
         if stage == "shape" and is_vague(value):
             stages["vague"] = Status.TOO_VAGUE

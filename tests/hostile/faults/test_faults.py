@@ -59,7 +59,7 @@ class Bench(NamedTuple):
         """
         found = {name: data for name, data in contents(out).items() if not Path(name).name.startswith(".")}
         for name in [name for name in found if "/parts/" in name]:
-            load_shard(out / name)
+            load_shard(out / name, {})
             del found[name]
         return all(data == self.whole[name] or name.startswith("step") for name, data in found.items())
 

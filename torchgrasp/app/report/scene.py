@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torchgrasp.app.report.canvas import GRID, INK, OBJECTS, PAPER, encode_png, rgb
 from torchgrasp.checks import checked
 from torchgrasp.files import write_file
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.scene import Scene
@@ -88,7 +89,7 @@ def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
     reach = -table.height(camera) / (rays @ normal).clamp(max=-1e-6)
     place = camera + reach[..., None] * rays
     across = image.obj_from_camera[:3, 0].double()
-    x = torch.nn.functional.normalize(across - (across @ normal) * normal, dim=0)
+    x = unit(across - (across @ normal) * normal)
     lines = np.zeros(tuple(image.depth.shape))
     for axis in (x, torch.linalg.cross(normal, x)):
         cells = ((place @ axis) / 0.1).numpy()

@@ -1,1 +1,1 @@
-"""Baselines: the paper's control law, position control, object-level impedance and learned grasp stability."""
+"""Baselines: the paper's control law, position control, object impedance, learned stability. Not public."""
