@@ -237,8 +237,8 @@ class Grasps(Batch):
     certificate: Annotated[Certificate, Rows("g")]
     score: Annotated[Float[Tensor, "g"], ANY]
     status: Int[Tensor, "g"]
-    known: Bool[Tensor, "g"] | None = None
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
+    known: Bool[Tensor, "g"] | None = None
 
     @property
     def success(self) -> Float[Tensor, "g"]:

@@ -8,6 +8,7 @@ import torch
 from tests.make import half_ball, see
 from torchgrasp import Status, load_hand, plan_scene
 from torchgrasp.cloud.camera import INTRINSICS
+from torchgrasp.planner import ThingPlan
 from torchgrasp.planner.graspable import hand_span, is_vague, judge_things, order_by_ease
 from torchgrasp.scene import Scene
 
@@ -79,9 +80,13 @@ def test_a_shape_that_may_be_anything_is_vague():
 
 def test_refused_objects_are_not_planned(monkeypatch):
     scene, planned = see((0.2, 0.0, 0.1, 0.008), BOX, (-0.15, 0.1, 0.1, 0.009)), []
-    monkeypatch.setattr("torchgrasp.planner.scene._plan_thing", lambda scene, plan: planned.append(scene.target))
-    with pytest.raises(AttributeError):  # of the result of None
-        plan_scene(scene, HAND, starts=10)
+
+    def plan(scene, plan):
+        planned.append(scene.target)
+        return ThingPlan(scene.target, 0.0)
+
+    monkeypatch.setattr("torchgrasp.planner.scene._plan_thing", plan)
+    plan_scene(scene, HAND, starts=10)
     assert planned == [2]
 
 

@@ -50,7 +50,7 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
 
 def _judge(scene: Scene, points: Float[Tensor, "n 3"], label: int, spec: ContactSpec, span: float) -> Status:
     """Return the first reason against an object with points in the upright frame."""
-    pixels, bounded = scene.pixels[scene.labels == label], scene.image.bounded
+    pixels, bounded = scene.pixels[scene.labels == label].cpu(), scene.image.bounded
     if len(pixels) < LEAST_PIXELS:
         return Status.FEW_PIXELS
     if bounded and _is_cut(pixels, scene.image.depth.shape):
@@ -86,7 +86,7 @@ def _is_see_through(pixels: Tensor, depth: Float[Tensor, "h w"]) -> bool:
     own[tuple(pixels.T.numpy())] = True
     part, reach = own[box], np.logical_or.accumulate
     down, right = reach(part, 0) & reach(part[::-1], 0)[::-1], reach(part, 1) & reach(part[:, ::-1], 1)[:, ::-1]
-    return int(((down | right) & (depth[box].numpy() == 0)).sum()) > len(pixels)
+    return int(((down | right) & (depth[box].cpu().numpy() == 0)).sum()) > len(pixels)
 
 
 def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:

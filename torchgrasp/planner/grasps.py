@@ -269,7 +269,7 @@ def no_grasps(hand: Hand) -> Grasps:
     certificate = Certificate(none(), none(), none(), none().bool(), none(6))
     return Grasps(
         none(hand.dof), none(hand.dof), none(3), none(4, 4), contacts, none(f).long(), none(f), none(), none(f),
-        certificate, none(), none().long(), none().bool(),
+        certificate, none(), none().long(), known=none().bool(),
     )  # fmt: skip
 
 
