@@ -22,7 +22,7 @@ BAND = 0.010  # heights [m] below this, of either sign, measure the noise of the
 LEAST_HEIGHT = 0.002  # least height [m] of an object's pixels above the table
 NEAR = 0.005  # distance [m] within which a pixel at a depth jump belongs to an object
 FEW = 6  # pieces with fewer pixels are noise
-GAP, TOUCH, FAR = 0.010, 3, 0.05
+GAP, TOUCH, FAR = 0.009, 3, 0.05
 """Pieces touch where TOUCH pixels are within GAP [m]; parts of one object are within FAR [m]."""
 OVERHANG = 0.05  # distance [m] to which an object extends beyond the visible region of its support
 VAST = 0.2  # greatest root mean square distance [m] of an object's points from their middle; a wall has more
