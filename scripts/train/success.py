@@ -46,7 +46,7 @@ def success(
         "weights": dict(zip(FEATURES, fitted.weights.tolist(), strict=True)),
         "bias": fitted.bias,
         "pose_error": fitted.pose_error,
-        "range": json.loads(model.read_text("utf-8"))["range"],  # of other trials, beside those of the fit
+        **{key: json.loads(model.read_text("utf-8"))[key] for key in ("range", "range_from")},  # not fitted here
         "fitted_on": f"{len(trials.passed)} trials of {bodies} authored bodies, {passed:.0%} passed",
         "trial": "torchgrasp.evaluation.pull with 7 N: " + "; ".join(", ".join(test) for test in TESTS),
         "on_kinds_of_bodies_left_out": {name: round(said[name], 4) for name in ("brier", "skill", "auc", "error")},

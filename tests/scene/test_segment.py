@@ -4,8 +4,8 @@ import trimesh
 
 from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
-from torchgrasp.cloud.support import Support
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.support import Support
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.segment import on_surface, segment
 

@@ -11,11 +11,11 @@ from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import LAYER, find_second_body
 from torchgrasp.cloud.prepare import FACING, share_facing
-from torchgrasp.cloud.support import LEAST_WIDTH, find_supports
 from torchgrasp.cloud.viewpoint import MAX_BEHIND, MAX_EDGE_ON, share_unseen
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.support import LEAST_WIDTH, find_supports
 from torchgrasp.values import PointCloud
 
 FEWEST = 50  # fewest points that show whether a camera is right, or whether pixels fly off rims

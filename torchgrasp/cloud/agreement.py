@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows
-from torchgrasp.cloud.plane_fit import assume_noise
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.plane_fit import assume_noise
 from torchgrasp.values import PointCloud
 
 if TYPE_CHECKING:

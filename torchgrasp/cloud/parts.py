@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchgrasp.checks import Range, checked
 from torchgrasp.cloud.check import MIN_POINTS, first_of_each
-from torchgrasp.cloud.support import Support, find_supports
 from torchgrasp.errors import NoSupport, TooFewPoints
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.support import Support, find_supports
 from torchgrasp.values import PointCloud
 
 LAYER = 0.004  # least half thickness [m] of a support's layer, for the noise of a depth camera at half a metre

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import RIGID, check_tensor, is_rigid
-from torchgrasp.cloud.support import Support, find_table
 from torchgrasp.cloud.tables import parse_npy, read_lines, read_suffixed
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.support import Support, find_table
 
 UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count is"
 

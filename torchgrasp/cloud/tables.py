@@ -146,7 +146,7 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
         if suffix == ".json":
             found = json.loads(data)
         else:
-            import yaml  # a requirement of pytorch-kinematics
+            import yaml
 
             found = next(yaml.safe_load_all(data))
     except Exception as error:  # YAML and JSON each raise their own

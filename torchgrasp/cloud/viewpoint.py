@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows, nearest
-from torchgrasp.cloud.support import fit_support
 from torchgrasp.errors import NoSupport
 from torchgrasp.geometry.linalg import fibonacci_sphere, unit
+from torchgrasp.geometry.support import fit_support
 
 MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
 """Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""

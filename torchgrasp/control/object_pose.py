@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation
 from torchgrasp.geometry.frames import apply, rotation_from_vector
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import across, unit
 
 TURNS, FINE_TURNS = (-0.24, -0.12, 0.0, 0.12, 0.24), (-0.06, 0.0, 0.06)
 """Turns [rad] of the object that `Localization` tries, and turns about the best of them."""
@@ -124,9 +124,7 @@ class Localization:
         self.surface, self.obj_from_hand = reference.surface, reference.obj_from_hand.double()
         self.center, self.radius = reference.gains.target.mean(0), reference.hand.tips.radius.double()
         self.up = unit(reference.table.normal.double())
-        across = torch.eye(3, dtype=torch.float64)[int(self.up.abs().argmin())]
-        first = unit(torch.linalg.cross(self.up, across))
-        self.axes = torch.stack([first, torch.linalg.cross(self.up, first)])
+        self.axes = torch.stack(across(self.up))
         self.step, self.cost = 0, torch.inf
         self.shift, self.turn = torch.zeros(2, dtype=torch.float64), 0.0
         self.coarse = self.shift, self.turn

@@ -70,10 +70,9 @@ def close_hand(
             only the tangent planes of the planned contacts are used.
 
     Raises:
-        BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint limits.
-        BadArgument: an approach that is no unit vector, or an error that is no finite (4, 4).
-        BadArgument: contacts that all lie off the mesh; a table that the mesh does not stand on.
-        BadArgument: the holding "law" for a closing that does not follow the law (Eq. 25).
+        BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint limits; an approach
+            that is no unit vector; contacts off the mesh; a table that the mesh does not stand on; the holding "law"
+            for a closing that does not follow it (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
 
@@ -86,7 +85,6 @@ def close_hand(
     """
     check_single(grasp)
     mesh = read_mesh(mesh)
-    # Most contacts may be off, as on an uncertain surface, but not all.
     check_agreement("mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99)
     if table is not None:
         check_stand(mesh, table)

@@ -24,6 +24,12 @@ def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
     return unit(v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent))  # a power of two rounds nothing
 
 
+def across(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Return two unit vectors across a unit vector, which with it make a right-handed frame (first, second, normal)."""
+    first = unit(torch.linalg.cross(normal, torch.eye(3).to(normal)[normal.abs().argmin()]))
+    return first, torch.linalg.cross(normal, first)
+
+
 def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:
     """Return n unit vectors spread evenly over the sphere, from +z to -z, in float64.
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.checks import checked
 from torchgrasp.geometry.frames import rotate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles, along
@@ -46,8 +46,7 @@ def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) 
     """Return the candidate approach directions in the object's frame."""
     pose = opened.obj_from_hand
     axis = unit(hand.approach.to(pose))
-    first = unit(torch.linalg.cross(axis, torch.eye(3).to(axis)[axis.abs().argmin()]))
-    second = torch.linalg.cross(axis, first)
+    first, second = across(axis)
     tilt, directions = math.radians(45), 8
     angle = torch.arange(directions).to(axis)[:, None] * (2 * math.pi / directions)
     tilted = math.cos(tilt) * axis + math.sin(tilt) * (torch.cos(angle) * first + torch.sin(angle) * second)

@@ -5,10 +5,12 @@
 """
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,7 +34,7 @@ FEATURES = (
 """The features of the model of success, in this order."""
 LEAST_ARM = 0.1  # added to the load's arm over the triangle's height, so that its logarithm is finite
 MODEL = Path(__file__).with_name("success.json")
-"""Weights and bias of the model, the range of its trials [m], and a description of its training data."""
+"""Weights and bias of the model, the range [m] in which trials or lifts support it, and what both were."""
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
@@ -128,22 +130,28 @@ def success_features(
     return torch.stack([closure, least / math.atan(friction), arm, lever], dim=-1)
 
 
+@functools.cache
+def _read_model() -> dict[str, Any]:
+    """Return the content of `MODEL`."""
+    return json.loads(MODEL.read_text("utf-8"))
+
+
 def success_log_odds(features: Float[Tensor, "g k"], hand: str) -> Float[Tensor, "g"]:
     """Return the log-odds log(p / (1 - p)) of success of grasps with the hand of this name.
 
     A hand without trials in the training data gets the least bias of the other hands.
     """
-    model = json.loads(MODEL.read_text("utf-8"))
+    model = _read_model()
     bias = model["bias"].get(hand, min(model["bias"].values()))
     return features @ features.new_tensor([model["weights"][name] for name in FEATURES]) + bias
 
 
 def is_known(shape: ShapeGP, grasps: Grasps, friction: float) -> Bool[Tensor, "g"]:
-    """Return for which grasps the model's trials support its prediction: by friction, size, deviation at contacts.
+    """Return for which grasps trials or lifts support the prediction: by friction, size, deviation at contacts.
 
     More friction than in the trials counts as known: it does not make a grasp worse.
     """
-    tried = json.loads(MODEL.read_text("utf-8"))["range"]
+    tried = _read_model()["range"]
     low, high = tried["half_size"]
     alike = friction >= tried["least_friction"] and low <= shape.scale <= high
     return alike & (grasps.contacts.require_std().amax(1) <= tried["most_deviation"])

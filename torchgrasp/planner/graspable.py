@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.checks import checked
-from torchgrasp.cloud.support import find_table
 from torchgrasp.errors import Status
 from torchgrasp.geometry.plane import to_upright, upright_frame
+from torchgrasp.geometry.support import find_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
 from torchgrasp.scene.segment import OVERHANG

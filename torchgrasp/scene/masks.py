@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.cloud.support import Support
 from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.support import Support
 from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
 from torchgrasp.scene.segment import count_labels, on_surface, segment
 

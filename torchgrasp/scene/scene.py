@@ -13,10 +13,10 @@ from torchgrasp.base import Value
 from torchgrasp.checks import Pose, Positive, checked
 from torchgrasp.cloud.pose import check_sizes, find_plausible
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
-from torchgrasp.cloud.support import find_table
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, to_upright
+from torchgrasp.geometry.support import find_table
 from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
 from torchgrasp.values import PointCloud

@@ -12,18 +12,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.sensor import fit_noise
-from torchgrasp.cloud.support import Support
 from torchgrasp.geometry.frames import inverse, rotate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.support import Hull, Support
 from torchgrasp.scene.image import DepthImage, label_radii
 
 BAND = 0.010  # heights [m] below this, of either sign, measure the noise of the table
 LEAST_HEIGHT = 0.002  # least height [m] of an object's pixels above the table
 NEAR = 0.005  # distance [m] within which a pixel at a depth jump belongs to an object
 FEW = 6  # pieces with fewer pixels are noise
-GAP, TOUCH, FAR = 0.009, 3, 0.05
+GAP, TOUCH, FAR = 0.008, 3, 0.05
 """Pieces touch where TOUCH pixels are within GAP [m]; parts of one object are within FAR [m]."""
+NESTED = 0.4  # a body with this share of its points over the footprint of a larger one is a part of it
 OVERHANG = 0.05  # distance [m] to which an object extends beyond the visible region of its support
 VAST = 0.2  # greatest root mean square distance [m] of an object's points from their middle; a wall has more
 
@@ -181,11 +182,11 @@ def _merge(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Fl
     if not len(names):
         return new
     order = torch.argsort(pieces[pieces > 0], stable=True)
-    parts = [part.numpy() for part in _over_table(image, table)[pieces > 0][order].split(count.tolist())]
+    parts = _over_table(image, table)[pieces > 0][order].split(count.tolist())
     floating = _floating(image, pieces, table, jump)[names].tolist()
-    gap = _gaps([KDTree(part) for part in parts])
+    gap = _gaps([KDTree(part.numpy()) for part in parts])
     large = [k for k in range(len(parts)) if len(parts[k]) >= 30]
-    bodies = _joined([_Body((k,), parts[k]) for k in large], gap, floating)
+    bodies = _joined([_Body((k,), parts[k], len(parts[k])) for k in large], gap, floating)
     for number, body in enumerate(bodies, start=1):
         new[names[list(body.rows)]] = number
     for k in range(len(parts)):  # smaller pieces go to the nearest large one
@@ -209,7 +210,7 @@ def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> lis
     for body in [body for body in done if all(floating[row] for row in body.rows)]:  # the roots of a handle are hidden
         others = [other for other in done if other is not body]
         nearest = min(others, key=lambda other: between(body, other), default=body)
-        reach = FAR if np.ptp(body.points, 0).max() < 0.7 * np.ptp(nearest.points, 0).max() else GAP
+        reach = FAR if body.size < 0.7 * nearest.size else GAP
         if body in done and nearest is not body and between(body, nearest) < reach:
             done = [other for other in others if other is not nearest] + [body + nearest]
     return done
@@ -217,9 +218,7 @@ def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> lis
 
 def _over_table(image: DepthImage, table: Plane) -> Float[Tensor, "h w 3"]:
     """Return the points of all pixels in a frame whose z is the height above the table."""
-    normal = table.normal.double()
-    x = unit(torch.linalg.cross(normal, torch.eye(3, dtype=torch.float64)[int(normal.abs().argmin())]))
-    axes, points = torch.stack([x, torch.linalg.cross(normal, x)], -1), image.points()
+    axes, points = torch.stack(across(table.normal.double()), -1), image.points()
     return torch.cat([points @ axes, table.height(points)[..., None]], -1)
 
 
@@ -237,46 +236,35 @@ def _gaps(trees: list[Any]) -> np.ndarray:
 
 
 class _Body:
-    """Pieces of one object: their numbers, some of their points, and the convex hull of their footprint."""
+    """Pieces of one object: their numbers, how many points they have, some points, and the hull of their footprint."""
 
-    def __init__(self, rows: tuple[int, ...], points: np.ndarray) -> None:
-        self.rows, self.points = rows, points[:: 1 + len(points) // 2000]
-        self.corners, self.sides = _footprint(points[:, :2])
-        self.top = float(np.quantile(self.points[:, 2], 0.98))
+    def __init__(self, rows: tuple[int, ...], points: Float[Tensor, "n 3"], count: int) -> None:
+        self.rows, self.count, self.points = rows, count, points[:: 1 + len(points) // 2000]
+        self.hull = Hull.of(points[:, :2])
+        self.top = float(self.points[:, 2].quantile(0.98))
 
     def __add__(self, other: "_Body") -> "_Body":
-        return _Body(self.rows + other.rows, np.concatenate([self.points, other.points]))
+        return _Body(self.rows + other.rows, torch.cat([self.points, other.points]), self.count + other.count)
 
-    def depth(self, points: np.ndarray) -> np.ndarray:
-        """Return how far [m] points are inside each side of the footprint."""
-        return -(points[:, :2] @ self.sides[:, :2].T + self.sides[:, 2])
-
-
-def _footprint(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners and the sides of a convex hull; no side, if all points are on a line."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        hull = ConvexHull(flat)
-    except QhullError:
-        return flat, np.array([[0.0, 0.0, 1.0]])
-    return flat[hull.vertices], hull.equations
+    @property
+    def size(self) -> float:
+        """The longest side [m] of the box about the points."""
+        return float((self.points.amax(0) - self.points.amin(0)).max())
 
 
 def _one_body(a: _Body, b: _Body, gap: float) -> bool:
     """Return whether two bodies touch, one is over the footprint of the other, or both are parts of one rim."""
     if gap < GAP or gap > FAR:
         return gap < GAP
-    small, large = (a, b) if len(a.points) < len(b.points) else (b, a)
-    if float((large.depth(small.points).min(-1) > 0).mean()) > 0.6:
+    small, large = (a, b) if a.count < b.count else (b, a)
+    if float(large.hull.holds(small.points[:, :2]).double().mean()) > NESTED:
         return True
-    both = np.concatenate([a.points, b.points])
-    sides = _footprint(np.concatenate([a.corners, b.corners]))[1]
-    inner = -(both[:, :2] @ sides[:, :2].T + sides[:, 2])
-    if abs(a.top - b.top) > 0.005 or gap > 0.4 * inner.max(0).min():  # two heights, or a wide gap in the rim
+    hull = Hull.of(torch.cat([a.hull.corners, b.hull.corners]))
+    if abs(a.top - b.top) > 0.005 or gap > 0.4 * hull.width:  # two heights, or a wide gap in the rim
         return False
-    high = both[:, 2] > max(a.top, b.top) - 0.004  # only a hollow body has no top in its middle
-    return float((inner[high].min(-1) > 0.012).mean()) < 0.05
+    both = torch.cat([a.points, b.points])
+    high = both[both[:, 2] > max(a.top, b.top) - 0.004, :2]  # only a hollow body has no top in its middle
+    return float(hull.holds(high, -0.012).double().mean()) < 0.05
 
 
 def _floating(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:

@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from benchmarks.common import Options, Row, bench
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
-from torchgrasp.cloud.support import Support
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.support import Support
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.segment import segment
 

@@ -18,7 +18,7 @@ import tyro
 from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
-from torchgrasp.app.cli import clouds, doctor, evaluate, export, grasps, hand_check, hands
+from torchgrasp.app.cli import clouds, depth, doctor, evaluate, export, grasps, hand_check, hands
 from torchgrasp.app.cli.command import Command, execute
 from torchgrasp.errors import BadArgument, GraspError
 
@@ -34,8 +34,8 @@ COMMANDS: dict[str, Callable[..., Command | int]] = {
     "campaign": evaluate.Campaign,
     "cloud check": clouds.CloudCheck,
     "cloud cut": clouds.CloudCut,
-    "cloud depth": clouds.CloudDepth,
-    "cloud scene": clouds.CloudScene,
+    "cloud depth": depth.CloudDepth,
+    "cloud scene": depth.CloudScene,
     "cloud thin": clouds.CloudThin,
     "cloud render": clouds.CloudRender,
     "cloud views": clouds.CloudViews,

@@ -11,6 +11,7 @@ from torchgrasp.checks import checked
 from torchgrasp.files import write_file
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.plane_fit import assume_noise
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.scene import Scene
 
@@ -72,7 +73,7 @@ def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "
     labels[tuple(scene.pixels.cpu().numpy().T)] = scene.labels.cpu().numpy()
     points, measured = image.points(), image.depth.numpy() > 0
     kinds = measured.astype(int)
-    near = 0.004 + 0.005 * image.depth.numpy() ** 2  # [m]: the noise of depth cameras
+    near = 3 * assume_noise(points.reshape(-1, 3), scene.viewpoint).reshape(labels.shape).numpy()
     if scene.table is not None:
         height = scene.table.height(points).numpy()
         kinds[measured & (height > near) & (labels == 0)] = 4

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.checks import check_tensor
-from torchgrasp.cloud.plane_fit import LEAST_SHARE, MOST_TILT, REACH, ROUGH, PlaneFit, View, assume_noise, fit_planes
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane, as_plane
+from torchgrasp.geometry.plane_fit import LEAST_SHARE, MOST_TILT, REACH, ROUGH, PlaneFit, View, assume_noise, fit_planes
 
 MOST_THROUGH = 0.1  # greatest number of points seen through a support's region, over the number on it
 LEAST_STANDING = 0.001  # least share of the points that stand low on a support, over its region
@@ -150,33 +150,36 @@ def bound(
     flat, lower = (((p - middle) @ axes) for p in (points[on], crossing[behind & ~on]))
     region = None
     for part in _parts(flat):
-        grown = _Hull.of(part if region is None else torch.cat([region.corners, part]))
+        grown = Hull.of(part if region is None else torch.cat([region.corners, part]))
         if region is None or int((grown.holds(lower) & ~region.holds(lower)).sum()) < 0.05 * len(part):
             region = grown
-    if region is None:
+    if region is None or region.width <= 0:
         return None
     outward = region.sides[:, :2] @ axes.T
     return Support(plane, torch.cat([outward, (region.sides[:, 2] - outward @ middle)[:, None]], -1), region.width)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Hull:
+class Hull:
     """A convex polygon: its corners [m], and outward unit normal and offset of each side."""
 
     corners: Float[Tensor, "k 2"]
     sides: Float[Tensor, "s 3"]
 
     @classmethod
-    def of(cls, points: Float[Tensor, "n 2"]) -> "_Hull":
-        """Return the convex hull of points in a plane."""
-        from scipy.spatial import ConvexHull
+    def of(cls, points: Float[Tensor, "n 2"]) -> "Hull":
+        """Return the convex hull of points in a plane; one that holds nothing, if all points are on a line."""
+        from scipy.spatial import ConvexHull, QhullError
 
-        hull = ConvexHull(points.numpy())
+        try:
+            hull = ConvexHull(points.numpy())
+        except QhullError:
+            return cls(points, points.new_tensor([[0.0, 0.0, math.inf]]))
         return cls(points[torch.from_numpy(hull.vertices).long()], torch.from_numpy(hull.equations))
 
-    def holds(self, points: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
-        """Return which points are inside."""
-        return (points @ self.sides[:, :2].T + self.sides[:, 2] < 0).all(-1)
+    def holds(self, points: Float[Tensor, "n 2"], margin: float = 0.0) -> Bool[Tensor, "n"]:
+        """Return which points are inside, or at most `margin` [m] beside it; a negative margin shrinks the polygon."""
+        return (points @ self.sides[:, :2].T + self.sides[:, 2] < margin).all(-1)
 
     @property
     def width(self) -> float:

@@ -1,0 +1,119 @@
+"""`torchgrasp cloud depth` and `torchgrasp cloud scene`: a cloud or a scene from a depth image."""
+
+from pathlib import Path
+
+from torchgrasp.app.cli.command import Command, arguments, option, positional, required
+from torchgrasp.app.cli.inputs import (
+    OUT_CLOUD_HELP,
+    read_table,
+)
+from torchgrasp.app.report.scene import draw_scene
+from torchgrasp.cloud import (
+    cloud_from_depth,
+    save_cloud,
+)
+from torchgrasp.cloud.pose import read_pose
+from torchgrasp.cloud.sensor import median_depth
+from torchgrasp.cloud.tables import read_image, read_intrinsics
+from torchgrasp.errors import BadArgument
+from torchgrasp.scene import Scene, save_scene
+
+
+@arguments(points="depth", path="out")
+class _DepthCommand(Command):
+    """The arguments of commands that read a depth image."""
+
+    depth: Path = positional(
+        'image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, or .npz with an array "depth"): integers are '
+        "millimetres, floats metres; 0 and NaN are not measured"
+    )
+    intrinsics: tuple[str, ...] = required(
+        "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height; or a file of ROS, "
+        "Open3D, RealSense, Zivid or BOP (.json, .yaml), or with a matrix (.npy, .txt)"
+    )
+    depth_unit: float | None = option(
+        None, "metres of one count of the depth: 0.0001 of a RealSense D405, 0.00025 of an L515, 0.001 of float mm"
+    )
+    out: Path = required(OUT_CLOUD_HELP)
+    mask: Path | None = option(
+        None,
+        'image of the depth\'s size that is not 0 at the object (.png, .npy, or .npz with an array "mask"); by default '
+        "every point is kept, or every object of a scene is found",
+    )
+    camera_pose: Path | None = option(
+        None, "file with frame_from_camera, 4 x 4 (.npy or .txt); by default results are in the camera's frame"
+    )
+    frames: tuple[Path, ...] = option(
+        (), "more depth images of the camera, which stands still: the median of each pixel has less noise"
+    )
+
+    def images(self):
+        """Return the depth image, the intrinsics, the mask and the camera pose; None where not given."""
+        if self.depth_unit is not None and not 0 < self.depth_unit <= 1:
+            raise BadArgument("--depth-unit", self.depth_unit, "metres of one count, above 0 and at most 1")
+        camera = self.intrinsics
+        if len(camera) == 1:
+            camera = read_intrinsics("intrinsics", Path(camera[0]), self.depth.stem)
+        else:
+            try:
+                camera = [float(word) for word in camera]
+            except ValueError as error:
+                raise BadArgument("intrinsics", " ".join(camera), "fx fy cx cy, or a file") from error
+        mask = None if self.mask is None else read_image("mask", self.mask)
+        pose = None if self.camera_pose is None else read_pose("camera_pose", self.camera_pose)
+        depth = read_image("depth", self.depth)
+        if self.frames:
+            depth = median_depth([depth, *(read_image("depth", path) for path in self.frames)])
+        return depth, camera, mask, pose
+
+
+@arguments()
+class CloudDepth(_DepthCommand):
+    """Write the point cloud of a depth image, with the camera as viewpoint."""
+
+    def run(self) -> int:
+        """Convert the depth image and write the cloud; return the exit code."""
+        depth, camera, mask, pose = self.images()
+        cloud = cloud_from_depth(depth, camera, mask, pose, self.depth_unit)
+        save_cloud(cloud, self.out)
+        frame = "the camera's frame: give its vertical with --up" if pose is None else "the frame of the pose"
+        print(f"{len(cloud)} points in {frame}, {self.out}")
+        return 0
+
+
+@arguments()
+class CloudScene(_DepthCommand):
+    """Write the scene of a depth image for `torchgrasp grasp`: the table and the objects on it; and its picture.
+
+    See docs/real_camera.md.
+    """
+
+    out: Path = required("scene to write (.npz); beside it a .png shows the table, objects and obstacles")
+    table: tuple[float, ...] | None = option(
+        None, "height z of the table, or four numbers nx ny nz d of the plane n . p = d [m]; by default it is found"
+    )
+    up: tuple[float, float, float] | None = option(None, "roughly against gravity, in the frame of the results")
+    point: tuple[float, float] | None = option(None, "column and row of a pixel on the target")
+
+    def run(self) -> int:
+        """Find the table and the objects, write the scene and its picture; return the exit code."""
+        picture = self.out.with_suffix(".png")
+        if picture.resolve() in [path.resolve() for path in (self.depth, self.mask, *self.frames) if path]:
+            raise BadArgument("--out", f"{self.out}, whose picture would replace {picture}", "another name")
+        depth, camera, mask, pose = self.images()
+        if self.up is not None and not any(self.up):
+            raise BadArgument("--up", "a vector of length zero", "the direction that points up")
+        table = None if self.table is None else read_table(self.table)
+        given = {"mask": mask, "point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit}
+        seen = Scene.from_depth(depth, camera, pose, **given)
+        save_scene(seen, self.out)
+        draw_scene(seen, picture)
+        for label in seen.things:
+            print(f"object {label}: {int(seen.rows_of(label).sum())} points{' (the target)' * (label == seen.target)}")
+        said = [f"table: {'unknown' if seen.table is None else seen.table.describe()}"]
+        noise, depth = seen.noise, seen.image.depth
+        if noise is not None:
+            random = 1e3 * float(noise.sigma(depth[depth > 0].median()))
+            said.append(f"noise: {random:.1f} mm of single pixels, {1e3 * noise.bias:.1f} mm of patches")
+        print(*said, *(f"advice: {sentence}" for sentence in seen.advice), f"{self.out}, {picture}", sep="\n")
+        return 0
