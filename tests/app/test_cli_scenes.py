@@ -1,12 +1,17 @@
 """`torchgrasp grasp` on scenes: what is taken, and one sentence for each bad input."""
 
+import json
+
 import numpy as np
 import pytest
+import torch
 import trimesh
+from PIL import Image
 
 from torchgrasp import Status, load_grasps
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.planner import ScenePlan, ThingPlan
+from torchgrasp.scene import read_scene
 
 CAMERA = look_at(20.0, 45.0, 0.7)
 
@@ -128,3 +133,85 @@ def test_cloud_scene_tells_a_pose_of_opengl_and_a_wrong_unit(seen, tmp_path, ref
     error = refusal(*words, "--camera-pose", tmp_path / "gl.txt")
     assert error.startswith("--camera-pose: ") and "OpenGL" in error and not (tmp_path / "s.npz").exists()
     assert "--depth-unit" in refusal(*words, "--depth-unit", "0.01")
+
+
+def run_lengths(mask):
+    edges = np.flatnonzero(np.diff(mask.T.ravel(), prepend=False, append=False))
+    return {"size": list(mask.shape), "counts": np.diff(edges, prepend=0, append=mask.size).tolist()}
+
+
+def save_as(path, labels, form):
+    """Write labels as another tool does."""
+    several = [labels == k for k in range(1, int(labels.max()) + 1)]
+    colours = np.array([[0, 0, 0], [0, 9, 7], [200, 0, 0]], dtype=np.uint8)[labels]
+    if form == "rle.json":
+        path.write_text(json.dumps([{"segmentation": run_lengths(mask)} for mask in several]))
+    elif form == "one.json":
+        path.write_text(json.dumps(run_lengths(labels > 0)))
+    elif form == "list.npz":
+        np.savez(path, *several)
+    elif form == "stack.npy":
+        np.save(path, np.stack(several))
+    elif form == "alpha.png":
+        Image.fromarray(np.concatenate([colours, np.full((*labels.shape, 1), 255, dtype=np.uint8)], -1)).save(path)
+    else:
+        Image.fromarray(colours if form == "colours.png" else labels.astype(form.split(".")[0])).save(path)
+    return path
+
+
+FORMS = ["rle.json", "list.npz", "stack.npy", "alpha.png", "colours.png", "uint8.png", "uint16.png", "int32.tiff"]
+
+
+@pytest.fixture
+def scene_words(seen, tmp_path):
+    np.save(tmp_path / "d.npy", seen["depth"])
+    np.savetxt(tmp_path / "pose.txt", seen["camera_pose"])
+    k = [str(float(INTRINSICS[i, j])) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    words = [tmp_path / "d.npy", "--intrinsics", *k, "--out", tmp_path / "s.npz"]
+    return [*words, "--camera-pose", tmp_path / "pose.txt"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_masks_of_each_form_are_the_objects_and_a_point_chooses(seen, scene_words, tmp_path, run_command, form):
+    path = save_as(tmp_path / form, seen["labels"], form)
+    point = ["--point", *middle(seen["labels"], 2)]
+    code, said, _ = run_command("cloud", "scene", *scene_words, "--mask", path, *point)
+    found = read_scene(tmp_path / "s.npz")
+    assert code == 0 and found.things == (1, 2) and found.target == 2 and "object 2" in said and "note" not in said
+    own = found.pixels[found.rows_of(2)]
+    assert (seen["labels"][tuple(own.T.numpy())] == 2).mean() > 0.99
+
+
+@pytest.mark.parametrize("form", ["one.json", "colours.png", "uint16.png"])
+def test_a_mask_of_one_object_is_the_target_and_the_table_below_is_told(seen, scene_words, tmp_path, run_command, form):
+    mask = seen["labels"] == 1
+    row, column = np.nonzero(mask)
+    mask[row.min() : row.max() + 20, column.min() : column.max() + 1] = True  # with a strip of the table
+    path = save_as(tmp_path / form, mask.astype(int), form)
+    code, said, _ = run_command("cloud", "scene", *scene_words, "--mask", path)
+    assert code == 0 and "(the target)" in said and "pixels lie on the support and were removed" in said
+    found = read_scene(tmp_path / "s.npz")
+    assert found.target == 1 and float(torch.quantile(found.cloud().points[:, 2], 0.02)) > 0.002
+    assert run_command("cloud", "depth", *scene_words, "--mask", path)[0] == 0
+
+
+BAD_MASKS = {
+    "m.json": (b"{", "well-formed .json"),
+    "n.json": (b'{"size": [480, 640], "counts": [1, 2]}', "run lengths"),
+    "o.json": (b'[{"segmentation": [[1, 2, 3, 4]]}]', "shape"),
+    "p.json": (b"[" * 9999, "well-formed .json"),
+    "q.png": (b"x" * 99, "well-formed .png"),
+    "r.jpg": (b"x" * 99, ".json file"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_MASKS)
+def test_a_bad_file_of_masks_is_refused_in_one_sentence(scene_words, tmp_path, refusal, name):
+    (tmp_path / name).write_bytes(BAD_MASKS[name][0])
+    error = refusal("cloud", "scene", *scene_words, "--mask", tmp_path / name)
+    assert error.startswith("--mask: ") and BAD_MASKS[name][1] in error and not (tmp_path / "s.npz").exists()
+
+
+def test_a_cloud_needs_a_mask_of_one_object(seen, scene_words, tmp_path, refusal):
+    path = save_as(tmp_path / "m.png", seen["labels"], "colours.png")
+    assert "--mask: expected one object" in refusal("cloud", "depth", *scene_words, "--mask", path)

@@ -1,8 +1,13 @@
+import functools
+
 import numpy as np
 import pytest
 import torch
 
+from tests.make import box
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.errors import BadArgument
+from torchgrasp.scene import Scene
 from torchgrasp.scene.masks import read_labels, read_mask
 
 LABELS = np.array([[0, 0, 2, 2], [1, 1, 0, 2], [1, 0, 0, 0]])
@@ -49,6 +54,7 @@ COLOURS = np.array([[0, 0, 0], [0, 9, 7], [200, 0, 0]], dtype=np.uint8)[LABELS]
         [{"segmentation": mask, "area": int(mask.sum())} for mask in masks()],
         [{"size": list(SHAPE), "counts": run_lengths(mask)} for mask in masks()],
         [{"size": list(SHAPE), "counts": as_text(run_lengths(mask)).encode()} for mask in masks()],
+        {"annotations": [{"segmentation": {"size": list(SHAPE), "counts": run_lengths(mask)}} for mask in masks()]},
     ],
 )
 def test_every_form_of_labels_is_the_same(given):
@@ -87,9 +93,32 @@ def test_a_transparent_picture_has_no_object_there():
         ({"size": list(SHAPE), "counts": [1, 2]}, "run lengths"),
         ({"size": list(SHAPE), "counts": "\x7f"}, "run lengths"),
         ({"counts": [12]}, "run lengths"),
+        ([[[1, 2], [1]], [[1]]], "whole numbers"),
+        ([{"segmentation": [1, 2, 3, 4]}], "got shape"),
+        (functools.reduce(lambda inner, _: [{"segmentation": inner}], range(3000), [1]), "whole numbers"),
+        (functools.reduce(lambda inner, _: {"segmentation": inner}, range(3000), [1]), "whole numbers"),
     ],
 )
 def test_a_bad_mask_is_one_sentence(given, message):
     with pytest.raises(BadArgument, match=message) as refused:
         read_mask(given, SHAPE)
     assert "\n" not in str(refused.value)
+
+
+def test_a_mask_of_object_and_table_is_trimmed_with_a_note():
+    pose = look_at(20.0, 45.0, 0.7)
+    depth, labels = render_depth([box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose)
+    row, column = torch.nonzero(labels == 2).T
+    drawn = torch.zeros_like(labels, dtype=torch.bool)
+    drawn[row.min() - 9 : row.max() + 9, column.min() - 9 : column.max() + 9] = True  # a box about the object
+    masked = Scene.from_depth(depth, INTRINSICS, pose, mask=drawn)
+    listed = Scene.from_depth(depth, INTRINSICS, pose, labels=[labels == 1, drawn & (labels != 1)])
+    exact = Scene.from_depth(depth, INTRINSICS, pose, labels=labels)
+    assert exact.notes == () and listed.things == (1, 2) and masked.target == 1
+    for scene, target, name in ((masked, 1, "mask: "), (listed, 2, "mask 2: ")):
+        (note,) = scene.notes
+        assert note.startswith(name) and note.endswith("pixels lie on the support and were removed")
+        removed, seen = (int(word) for word in note.removeprefix(name).split()[::2][:2])
+        assert 0.8 < removed / int((drawn & (labels == 0)).sum()) < 1.2 and removed < seen
+        own = scene.pixels[scene.rows_of(target)]
+        assert float((labels[own[:, 0], own[:, 1]] == 2).double().mean()) > 0.98

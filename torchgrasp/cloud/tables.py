@@ -31,15 +31,15 @@ def parse_npy(data: bytes) -> np.ndarray:
     return np.lib.format.read_array(stream, allow_pickle=False)
 
 
-def parse_npz(data: bytes, names: Sequence[str], required: str) -> dict[str, np.ndarray]:
-    """Return the arrays of these names in a .npz file.
+def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str, np.ndarray]:
+    """Return the arrays of these names in a .npz file; of any name, where no name is given.
 
     Raises:
         ValueError: no array of the `required` name, arrays that are too large unpacked, or what `parse_npy` refuses.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = [info for info in archive.infolist() if info.filename.removesuffix(".npy") in names]
-        if f"{required}.npy" not in [info.filename for info in members]:
+        members = [info for info in archive.infolist() if not names or info.filename.removesuffix(".npy") in names]
+        if required and f"{required}.npy" not in [info.filename for info in members]:
             found = [info.filename.removesuffix(".npy") for info in archive.infolist()][:8]
             raise ValueError(f"no array named {required!r}, but {found}")
         if sum(info.file_size for info in members) > CLOUD_BYTES:
@@ -103,27 +103,41 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
     return table
 
 
-def read_image(name: str, path: Path | str) -> np.ndarray:
-    """Return the numbers of an image file: .npy, .npz with an array `depth` or `mask`, .png, .tiff or .exr.
+def read_image(name: str, path: Path | str) -> Any:
+    """Return the numbers of an image file: .npy, .npz, .png, .tiff; of depth .exr, of masks .json.
 
     Args:
-        name: "depth" or "mask", the name in errors and in .npz files.
+        name: in errors: "depth", which is one channel and an array of this name; or "mask", which may be a picture, or
+            several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
         path: the file.
 
     Raises:
-        BadArgument: no such file, another suffix, malformed content, a picture of several channels, or no OpenEXR.
+        BadArgument: no such file, another suffix, malformed content, depth of several channels, or no OpenEXR.
     """
-    data, suffix = read_suffixed(name, path, (".npy", ".npz", ".png", ".tif", ".tiff", ".exr"))
+    masks = name == "mask"
+    data, suffix = read_suffixed(name, path, (".npy", ".npz", ".png", ".tif", ".tiff", ".json" if masks else ".exr"))
     try:
         if suffix == ".npy":
             return parse_npy(data)
         if suffix == ".npz":
-            return parse_npz(data, (name,), name)[name]
-        return _read_exr(Path(path)) if suffix == ".exr" else _parse_picture(data)
+            arrays = parse_npz(data, () if masks else (name,), "" if masks else name)
+            several = list(arrays.values())
+            return arrays.get(name, several[0] if len(several) == 1 else several)
+        if suffix == ".json":
+            return parse_json(data)
+        return _read_exr(Path(path)) if suffix == ".exr" else _parse_picture(data, masks)
     except ModuleNotFoundError as error:
         raise BadArgument(name, f"{path} without the package OpenEXR", "pip install OpenEXR, or a .png file") from error
     except Exception as error:  # zlib, zipfile, numpy and Pillow each raise their own
-        raise BadArgument(name, f"{path}: {error!r}", f"a well-formed {suffix} file of one channel") from error
+        allowed = f"a well-formed {suffix} file" + " of one channel" * (not masks)
+        raise BadArgument(name, f"{path}: {error!r}", allowed) from error
+
+
+def parse_json(data: bytes) -> Any:
+    """Return the content of a JSON file; raise `ValueError` for a large file."""
+    if len(data) > JSON_BYTES:
+        raise ValueError(f"{len(data)} bytes")
+    return json.loads(data)
 
 
 def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
@@ -141,13 +155,13 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
     try:
         if suffix in (".npy", ".txt"):
             return parse_npy(data).squeeze() if suffix == ".npy" else read_lines(data).squeeze()
-        if len(data) > (JSON_BYTES if suffix == ".json" else TOML_BYTES):
-            raise ValueError(f"{len(data)} bytes")
         if suffix == ".json":
-            found = json.loads(data)
+            found = parse_json(data)
         else:
             import yaml
 
+            if len(data) > TOML_BYTES:
+                raise ValueError(f"{len(data)} bytes")
             found = next(yaml.safe_load_all(data))
     except Exception as error:  # YAML and JSON each raise their own
         raise BadArgument(name, f"{path}: {error!r}", f"a well-formed {suffix} file of intrinsics") from error
@@ -166,11 +180,13 @@ def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tup
     return read_bytes(path), path.suffix.lower()
 
 
-def _parse_picture(data: bytes) -> np.ndarray:
-    """Return the pixels of a PNG or TIFF of one channel: uint16, uint8, bool, or float32."""
+def _parse_picture(data: bytes, colours: bool) -> np.ndarray:
+    """Return the pixels of a PNG or TIFF: uint16, uint8, bool, or float32; of several channels if it may be coloured."""
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=("PNG", "TIFF")) as image:
+        if colours and image.mode in ("P", "RGB", "RGBA"):  # the number of a palette's colour is the label
+            return np.asarray(image)
         if image.mode not in ("1", "L", "I", "I;16", "I;16B", "F"):
             raise ValueError(f"a picture of mode {image.mode}")
         return np.asarray(image)

@@ -1,5 +1,6 @@
 """Masks and labels of objects from other tools: images, lists of masks, and COCO's run lengths."""
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,7 +23,8 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
     Args:
         labels: numbers of the shape, of any type, or with one channel more; a picture (h, w, 3 or 4) with a colour for
             each object, where black and transparent are none; a list of masks, where the smaller lies above the larger;
-            a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its "segmentation".
+            a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its "segmentation"; or a dict
+            with a list of "annotations".
         shape: of the depth (h, w), or of the cloud (n,).
         name: of the argument, in errors.
 
@@ -33,13 +35,38 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
     tensor([[0, 1, 0],
             [1, 0, 0]])
     """
+    if isinstance(labels, Mapping) and "annotations" in labels:
+        labels = labels["annotations"]
+    masks = _masks(labels, shape)
+    if masks is None:
+        return _read_one(labels, shape, name)
+    stack, size = torch.zeros(shape, dtype=torch.long), torch.zeros(shape, dtype=torch.long)
+    for k, mask in enumerate(masks, start=1):
+        inside = _read_one(mask, shape, name) > 0
+        own = int(inside.sum())
+        above = inside & ((stack == 0) | (own <= size))
+        stack[above], size[above] = k, own
+    return stack
+
+
+def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
+    """Return the masks of a list, or of an array (k, h, w) or (k, 1, h, w); None: something else."""
+    if isinstance(labels, Tensor | np.ndarray):
+        several = len(shape) == 2 and tuple(labels.shape[1:]) in (shape, (1, *shape))
+        return labels.reshape(-1, *shape) if several else None
+    with contextlib.suppress(ValueError, TypeError, KeyError):  # of rows of different length, and of other types
+        if len(labels) and (isinstance(labels[0], Mapping) or np.ndim(labels[0]) >= 2):
+            return labels
+    return None
+
+
+def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..."]:
+    """Return the labels in an array or in run lengths."""
+    while isinstance(labels, Mapping) and "segmentation" in labels:
+        labels = labels["segmentation"]
     if isinstance(labels, Mapping):
-        if "segmentation" in labels:
-            return read_labels(labels["segmentation"], shape, name)
         return _runs(labels, shape, name).long()
     whole = f"whole numbers of shape {tuple(shape)}, one for each pixel or point"
-    if isinstance(labels, Sequence) and len(labels) and (isinstance(labels[0], Mapping) or np.ndim(labels[0]) >= 2):
-        return _stacked([read_labels(mask, shape, name) for mask in labels])
     try:
         read = labels.detach().cpu().numpy() if isinstance(labels, Tensor) else np.asarray(labels)
         numbers = read.astype(np.int64)
@@ -52,8 +79,6 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
         colour = numbers[..., :3] * (numbers[..., 3:] > 0) if read.shape[-1] == 4 else numbers
         packed = torch.from_numpy(np.abs(colour) @ np.array([1 << 32, 1 << 16, 1]))
         return torch.cat([packed.new_zeros(1), packed.reshape(-1)]).unique(return_inverse=True)[1][1:].reshape(shape)
-    if len(shape) == 2 and read.ndim > 2 and read.size and read.shape in ((len(read), *shape), (len(read), 1, *shape)):
-        return _stacked([read_labels(mask.reshape(shape), shape, name) for mask in read])
     if read.shape != tuple(shape) or not exact:
         raise BadArgument(name, f"shape {read.shape}, {read.dtype}", whole)
     if (numbers < 0).any():
@@ -74,14 +99,6 @@ def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
     if len(found) > 1:
         raise BadArgument("mask", f"{len(found)} values beside 0", "one object; give several objects as labels")
     return labels > 0
-
-
-def _stacked(masks: list[Int[Tensor, "h w"]]) -> Int[Tensor, "h w"]:
-    """Return the labels 1, 2, ... of masks, the smaller above the larger."""
-    labels = torch.zeros_like(masks[0])
-    for k in sorted(range(len(masks)), key=lambda k: -int((masks[k] > 0).sum())):
-        labels[masks[k] > 0] = k + 1
-    return labels
 
 
 def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Tensor, "h w"]:
@@ -119,11 +136,11 @@ def _run_lengths(text: bytes) -> list[int]:
 
 def label_image(
     image: DepthImage, support: Support, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
-) -> Int[Tensor, "h w"]:
+) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
     """Return the label of each pixel: the given ones without table and flying pixels, or those of `segment`.
 
     A mask becomes label 1. It loses the table and strips of neighbours. Other parts of its object just outside of it
-    belong to nothing.
+    belong to nothing. Also return a note for each mask that loses a twentieth or more.
 
     Raises:
         BadArgument: nothing but the table is left of a mask, or nothing of all labels.
@@ -132,10 +149,16 @@ def label_image(
         kept = torch.where(on_surface(image, support.plane), labels, 0)
         if not bool((kept > 0).any()):
             raise BadArgument("labels", "none that rises above the table", "labels of objects on the table")
-        return kept
+        low = torch.where(_on_support(image, support) & (kept == 0), labels, 0)
+        return kept, tuple(
+            note
+            for k in labels.unique().tolist()
+            for note in _removed(f"mask {k}", int((low == k).sum()), int(((labels == k) & (image.depth > 0)).sum()))
+            if k > 0
+        )
     objects = segment(image, support)
     if mask is None:
-        return objects
+        return objects, ()
     inside = mask & on_surface(image, support.plane)
     pieces, length = torch.where(inside, objects, 0), int(objects.max()) + 1
     whole, part = count_labels(objects, length), count_labels(pieces, length)
@@ -155,4 +178,16 @@ def label_image(
     rest = torch.where(few[rest], 0, rest)
     _, number = torch.cat([torch.zeros(1, dtype=torch.long), rest.reshape(-1)]).unique(return_inverse=True)
     rest = number[1:].reshape(rest.shape)
-    return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0))
+    low, strips = mask & ~inside & _on_support(image, support), inside & ~target
+    notes = [*_removed("mask", int(low.sum()), seen), *_removed("mask", int(strips.sum()), seen, "another object")]
+    return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0)), tuple(notes)
+
+
+def _on_support(image: DepthImage, support: Support) -> Bool[Tensor, "h w"]:
+    """Return which pixels lie on the support or below it; others that a mask loses fly at a rim."""
+    return (image.depth > 0) & (support.plane.height(image.points()) < 0.01)
+
+
+def _removed(mask: str, count: int, seen: int, where: str = "the support") -> list[str]:
+    """Return a note on pixels that a mask loses, if they are many."""
+    return [f"{mask}: {count} of {seen} pixels lie on {where} and were removed"] if count > 0.05 * seen else []

@@ -35,6 +35,7 @@ class Scene(Value):
         table: the plane that the objects stand on; None: unknown.
         target: label of the object to be grasped; None: not chosen.
         others: other planes that objects could stand on, the more plausible first.
+        notes: what was removed of given masks or labels, a sentence each.
 
     >>> from torchgrasp import load_scene
     >>> target = load_scene().select([394, 312])  # a clicked pixel: column, row
@@ -49,6 +50,7 @@ class Scene(Value):
     table: Plane | None = None
     target: int | None = None
     others: tuple[Plane, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @classmethod
     @checked
@@ -94,12 +96,14 @@ class Scene(Value):
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points, measured = image.points(), image.depth > 0
         supports = find_plausible(points[measured], image.obj_from_camera, table, up, depth_unit is not None)
-        found = label_image(image, supports[0], given, inside)
+        found, notes = label_image(image, supports[0], given, inside)
         if table is None and depth_unit is None:
             check_sizes(points[measured], found[measured], image.obj_from_camera[:3, 3], supports[0].plane)
         target = None if mask is None else 1
         planes = tuple(support.plane for support in supports)
-        scene = cls(points[measured], found[measured], image, torch.nonzero(measured), planes[0], target, planes[1:])
+        scene = cls(
+            points[measured], found[measured], image, torch.nonzero(measured), planes[0], target, planes[1:], notes
+        )
         return scene if point is None else scene.select(point)
 
     @classmethod
@@ -163,9 +167,9 @@ class Scene(Value):
             whole[row[front], column[front]] = values[front]
             return whole
 
-        found = label_image(image, supports[0], to_image(given), to_image(inside))
+        found, notes = label_image(image, supports[0], to_image(given), to_image(inside))
         own = torch.where(front, found[row, column], 0)
-        scene = cls(points, own, image, pixels, planes[0], None if inside is None else 1, planes[1:])
+        scene = cls(points, own, image, pixels, planes[0], None if inside is None else 1, planes[1:], notes)
         return scene if point is None else scene.select(point)
 
     @checked

@@ -3,20 +3,15 @@
 from pathlib import Path
 
 from torchgrasp.app.cli.command import Command, arguments, option, positional, required
-from torchgrasp.app.cli.inputs import (
-    OUT_CLOUD_HELP,
-    read_table,
-)
+from torchgrasp.app.cli.inputs import OUT_CLOUD_HELP, read_table
 from torchgrasp.app.report.scene import draw_scene
-from torchgrasp.cloud import (
-    cloud_from_depth,
-    save_cloud,
-)
+from torchgrasp.cloud import cloud_from_depth, save_cloud
 from torchgrasp.cloud.pose import read_pose
 from torchgrasp.cloud.sensor import median_depth
 from torchgrasp.cloud.tables import read_image, read_intrinsics
 from torchgrasp.errors import BadArgument
 from torchgrasp.scene import Scene, save_scene
+from torchgrasp.scene.masks import read_labels, read_mask
 
 
 @arguments(points="depth", path="out")
@@ -37,8 +32,9 @@ class _DepthCommand(Command):
     out: Path = required(OUT_CLOUD_HELP)
     mask: Path | None = option(
         None,
-        'image of the depth\'s size that is not 0 at the object (.png, .npy, or .npz with an array "mask"); by default '
-        "every point is kept, or every object of a scene is found",
+        "mask of the object, of the depth's size and not 0 there, for `cloud scene` also of several objects: a picture "
+        "with a colour or a number for each (.png, .tiff, .npy), masks (.npy, .npz), or COCO's run lengths (.json); by "
+        "default every point is kept, or every object of a scene is found",
     )
     camera_pose: Path | None = option(
         None, "file with frame_from_camera, 4 x 4 (.npy or .txt); by default results are in the camera's frame"
@@ -48,7 +44,7 @@ class _DepthCommand(Command):
     )
 
     def images(self):
-        """Return the depth image, the intrinsics, the mask and the camera pose; None where not given."""
+        """Return the depth image, the intrinsics, labels of the mask and the camera pose; None where not given."""
         if self.depth_unit is not None and not 0 < self.depth_unit <= 1:
             raise BadArgument("--depth-unit", self.depth_unit, "metres of one count, above 0 and at most 1")
         camera = self.intrinsics
@@ -64,6 +60,9 @@ class _DepthCommand(Command):
         depth = read_image("depth", self.depth)
         if self.frames:
             depth = median_depth([depth, *(read_image("depth", path) for path in self.frames)])
+        size = tuple(depth.shape[-3:-1] if depth.ndim == 3 and depth.shape[-1] == 1 else depth.shape[-2:])
+        if mask is not None:
+            mask = read_labels(mask, size, "mask")
         return depth, camera, mask, pose
 
 
@@ -74,14 +73,15 @@ class CloudDepth(_DepthCommand):
     def run(self) -> int:
         """Convert the depth image and write the cloud; return the exit code."""
         depth, camera, mask, pose = self.images()
-        cloud = cloud_from_depth(depth, camera, mask, pose, self.depth_unit)
+        inside = None if mask is None else read_mask(mask, tuple(mask.shape))
+        cloud = cloud_from_depth(depth, camera, inside, pose, self.depth_unit)
         save_cloud(cloud, self.out)
         frame = "the camera's frame: give its vertical with --up" if pose is None else "the frame of the pose"
         print(f"{len(cloud)} points in {frame}, {self.out}")
         return 0
 
 
-@arguments()
+@arguments(labels="mask")
 class CloudScene(_DepthCommand):
     """Write the scene of a depth image for `torchgrasp grasp`: the table and the objects on it; and its picture.
 
@@ -104,8 +104,9 @@ class CloudScene(_DepthCommand):
         if self.up is not None and not any(self.up):
             raise BadArgument("--up", "a vector of length zero", "the direction that points up")
         table = None if self.table is None else read_table(self.table)
-        given = {"mask": mask, "point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit}
-        seen = Scene.from_depth(depth, camera, pose, **given)
+        given = {"point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit}
+        chosen = "mask" if mask is None or len(mask[mask > 0].unique()) < 2 else "labels"
+        seen = Scene.from_depth(depth, camera, pose, **given, **{chosen: mask})
         save_scene(seen, self.out)
         draw_scene(seen, picture)
         for label in seen.things:
@@ -115,5 +116,6 @@ class CloudScene(_DepthCommand):
         if noise is not None:
             random = 1e3 * float(noise.sigma(depth[depth > 0].median()))
             said.append(f"noise: {random:.1f} mm of single pixels, {1e3 * noise.bias:.1f} mm of patches")
-        print(*said, *(f"advice: {sentence}" for sentence in seen.advice), f"{self.out}, {picture}", sep="\n")
+        said += [f"note: {sentence}" for sentence in seen.notes] + [f"advice: {sentence}" for sentence in seen.advice]
+        print(*said, f"{self.out}, {picture}", sep="\n")
         return 0
