@@ -181,7 +181,7 @@ def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tup
 
 
 def _parse_picture(data: bytes, colours: bool) -> np.ndarray:
-    """Return the pixels of a PNG or TIFF: uint16, uint8, bool, or float32; of several channels if it may be coloured."""
+    """Return the pixels of a PNG or TIFF: uint16, uint8, bool, or float32; `colours`: or of several channels."""
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=("PNG", "TIFF")) as image:

@@ -1,7 +1,7 @@
 """Masks and labels of objects from other tools: images, lists of masks, and COCO's run lengths."""
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np

@@ -104,9 +104,9 @@ class CloudScene(_DepthCommand):
         if self.up is not None and not any(self.up):
             raise BadArgument("--up", "a vector of length zero", "the direction that points up")
         table = None if self.table is None else read_table(self.table)
-        given = {"point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit}
         chosen = "mask" if mask is None or len(mask[mask > 0].unique()) < 2 else "labels"
-        seen = Scene.from_depth(depth, camera, pose, **given, **{chosen: mask})
+        given = {"point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit, chosen: mask}
+        seen = Scene.from_depth(depth, camera, pose, **given)
         save_scene(seen, self.out)
         draw_scene(seen, picture)
         for label in seen.things:
