@@ -1,8 +1,7 @@
 import numpy as np
 import trimesh
 
-from torchgrasp.app.report.canvas import _sharp_normals, frame_camera
-from torchgrasp.app.report.raster import Camera, Triangles, concatenate, render
+from torchgrasp.app.report.canvas import Camera, Triangles, concatenate, frame_camera, render, sharp_normals
 
 WHITE, RED, BLUE = (1.0, 1.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 NONE = concatenate([])
@@ -89,10 +88,10 @@ def test_normals_are_sharp_on_a_box_and_smooth_on_a_ball():
     box = trimesh.creation.box((1.0, 2.0, 3.0))
     faces = np.asarray(box.faces)
     np.testing.assert_allclose(
-        _sharp_normals(np.asarray(box.vertices), faces), np.repeat(box.face_normals[:, None], 3, 1), atol=1e-12
+        sharp_normals(np.asarray(box.vertices), faces), np.repeat(box.face_normals[:, None], 3, 1), atol=1e-12
     )
     ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
-    smooth = _sharp_normals(np.asarray(ball.vertices), np.asarray(ball.faces))
+    smooth = sharp_normals(np.asarray(ball.vertices), np.asarray(ball.faces))
     assert ((smooth * ball.vertices[ball.faces]).sum(-1) > 0.999).all()
 
 

@@ -54,8 +54,7 @@ class Export(Command):
     most: Count = option(20, "number of grasps, the best first")
     force: float = option(4.0, "normal force of the strongest finger [N] in the squeeze")
     kp: float | None = option(
-        None,
-        "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's",
+        None, "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's"
     )
     object: str | None = option(None, "dexgraspbench: its folder of the object; graspgen: the mesh in its data set")
 

@@ -1,11 +1,10 @@
-"""Common colours of all pictures, and the canvas that collects shapes and renders them to a picture."""
+"""Common colours of all pictures, and a canvas that renders its triangles to pixels in NumPy, without OpenGL."""
 
 import io
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
-
-from torchgrasp.app.report.raster import Camera, Triangles, concatenate, render
+from jaxtyping import Bool, Float, Int, UInt8
 
 Direction = tuple[float, float, float]
 
@@ -22,6 +21,23 @@ PAPER, INK, GRID, ALARM = "#fcfcfa", "#22262b", "#dcdad3", "#c2452d"
 SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a page of three columns
 
 
+class Triangles(NamedTuple):
+    """Corners of triangles with normals and colours in [0, 1]; unlit triangles keep their colours."""
+
+    corners: Float[np.ndarray, "t 3 3"]
+    normals: Float[np.ndarray, "t 3 3"]
+    colors: Float[np.ndarray, "t 3 3"]
+    lit: Bool[np.ndarray, " t"]
+
+
+class Camera(NamedTuple):
+    """A pinhole camera: the rows of `frame` are right, up and back; `angle` is the vertical field of view [rad]."""
+
+    position: Float[np.ndarray, "3"]
+    frame: Float[np.ndarray, "3 3"]
+    angle: float
+
+
 class Canvas:
     """A collection of shapes that is rendered to one picture."""
 
@@ -36,24 +52,24 @@ class Canvas:
         color: str | Float[np.ndarray, "v 3"],
         normals: Float[np.ndarray, "v 3"] | None = None,
         transparent: bool = False,
+        lit: bool = True,
     ) -> None:
         """Add a mesh with one colour, or a colour for each vertex; without `normals` large bends give sharp edges."""
         corners = vertices[faces]
-        bent = _sharp_normals(vertices, faces) if normals is None else normals[faces]
+        bent = sharp_normals(vertices, faces) if normals is None else normals[faces]
         shade = np.broadcast_to(rgb(color), corners.shape) if isinstance(color, str) else color[faces]
-        triangles = Triangles(corners, bent, shade, np.ones(len(corners), dtype=bool))
+        triangles = Triangles(corners, bent, shade, np.full(len(corners), lit))
         (self.transparent if transparent else self.solid).append(triangles)
 
     def add_points(self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "n 3"]) -> None:
         """Add points as small balls, each in its colour."""
         from trimesh import creation
 
-        size = 0.006 * float(np.linalg.norm(np.ptp(points, axis=0)))
-        ball = creation.icosphere(subdivisions=0, radius=1.0)  # too small on the page for its faces to show
-        corners = (points[:, None, None] + size * ball.vertices[ball.faces]).reshape(-1, 3, 3)
-        normals = np.tile(ball.vertices[ball.faces], (len(points), 1, 1))
-        shades = np.broadcast_to(np.repeat(colors, len(ball.faces), 0)[:, None], corners.shape)
-        self.solid.append(Triangles(corners, normals, shades, np.ones(len(corners), dtype=bool)))
+        ball = creation.icosphere(subdivisions=0, radius=0.006 * float(np.linalg.norm(np.ptp(points, axis=0))))
+        n, k = len(points), len(ball.vertices)  # too small on the page for its faces to show
+        faces = (k * np.arange(n)[:, None, None] + ball.faces).reshape(-1, 3)
+        vertices = (points[:, None] + ball.vertices).reshape(-1, 3)
+        self.add_mesh(vertices, faces, np.repeat(colors, k, 0), np.tile(ball.vertices, (n, 1)))
 
     def add_arrows(
         self,
@@ -63,33 +79,26 @@ class Canvas:
         colors: tuple[str, ...],
     ) -> None:
         """Add arrows of one length [m] in unit directions, each with its colour and a small ball at its start."""
-        from trimesh import creation
+        from trimesh import creation, geometry
 
         head = creation.cone(radius=0.1, height=0.35, sections=8)
         head.apply_translation([0.0, 0.0, 0.65])
-        upright = (
-            creation.icosphere(subdivisions=1, radius=0.13),
-            creation.cylinder(radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8),
-            head,
-        )
+        shaft = creation.cylinder(radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8)
         for start, direction, color in zip(points, directions, colors, strict=True):
-            side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
-            side /= np.linalg.norm(side)
-            axes = np.stack([side, np.cross(direction, side), direction])
-            for part in upright:
-                self.add_mesh(length * np.asarray(part.vertices) @ axes + start, np.asarray(part.faces), color)
+            turn = np.asarray(geometry.align_vectors([0.0, 0.0, 1.0], direction))[:3, :3]
+            for part in (creation.icosphere(subdivisions=1, radius=0.13), shaft, head):
+                self.add_mesh(length * part.vertices @ turn.T + start, part.faces, color)
 
     def add_table(self, corners: Float[np.ndarray, "n 3"], height: float | None) -> None:
         """Add a round table top, without shading, under `corners` at a height [m]; None: no table."""
+        from trimesh import creation
+
         if height is None:
             return
-        center = np.append((corners[:, :2].min(0) + corners[:, :2].max(0)) / 2, height - 1e-3)
         radius = 0.55 * float(np.linalg.norm(np.ptp(corners[:, :2], axis=0))) + 0.02
-        angle = np.linspace(0.0, 2 * np.pi, 121)
-        rim = center + radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], 1)
-        corners = np.stack([np.broadcast_to(center, (120, 3)), rim[:-1], rim[1:]], 1)
-        normals, shade = (np.broadcast_to(row, corners.shape) for row in ((0.0, 0.0, 1.0), rgb(TABLE)))
-        self.solid.append(Triangles(corners, normals, shade, np.zeros(len(corners), dtype=bool)))
+        top = creation.cylinder(radius, 1e-4, sections=120)
+        center = np.append((corners[:, :2].min(0) + corners[:, :2].max(0)) / 2, height - 1e-3)
+        self.add_mesh(top.vertices + center, top.faces, TABLE, lit=False)
 
     def render(self, camera: Camera, size: tuple[int, int] = SIZE) -> UInt8[np.ndarray, "h w 3"]:
         """Return the picture that a camera sees, as pixels."""
@@ -134,29 +143,104 @@ def frame_camera(
     return Camera(center + back * distance, frame, float(angle))
 
 
-def _sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
-    """Return a normal for each corner of each face: the mean of adjacent faces that bend by less than 40 degrees."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    weighted = np.cross(b - a, c - a)  # its length is twice the area of the face
-    flat = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
-    # Pair each corner with all corners at the same place, by the order of the places.
-    _, place = np.unique(np.round(vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
-    at = place.reshape(-1)[faces].reshape(-1)
-    order = np.argsort(at, kind="stable")
-    counts = np.bincount(at)
+def sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
+    """Return a normal for each corner of each face; faces that bend by less than 40 degrees are one smooth surface."""
+    import trimesh
+
+    smooth = trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, faces), np.deg2rad(40.0), facet_minarea=None)
+    normals = np.empty((len(faces), 3, 3))
+    normals[np.concatenate(smooth.metadata["original_components"])] = smooth.vertex_normals[smooth.faces]
+    return normals
+
+
+def concatenate(parts: list[Triangles]) -> Triangles:
+    """Return several sets of triangles, or none, as one set."""
+    empty = np.zeros((0, 3, 3))
+    none = Triangles(empty, empty, empty, np.zeros(0, dtype=bool))
+    return Triangles(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
+
+
+def render(
+    solid: Triangles,
+    transparent: Triangles,
+    camera: Camera,
+    size: tuple[int, int],
+    background: tuple[float, float, float],
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the picture of opaque triangles, with the nearest layer of half-transparent triangles over them."""
+    samples = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
+    width, height = size[0] * samples, size[1] * samples
+    image = np.tile(np.array(background, dtype=np.float32), (height * width, 1))
+    near = np.zeros(height * width)
+    sample, inverse_distance, color = _cast(solid, camera, width, height)
+    image[sample], near[sample] = color, inverse_distance
+    sample, inverse_distance, color = _cast(transparent, camera, width, height)
+    front = inverse_distance > near[sample]
+    image[sample[front]] += 0.5 * (color[front] - image[sample[front]])
+    pixels = image.reshape(size[1], samples, size[0], samples, 3).mean((1, 3))
+    return (255.0 * np.clip(pixels, 0.0, 1.0) + 0.5).astype(np.uint8)
+
+
+def _cast(
+    triangles: Triangles, camera: Camera, width: int, height: int
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
+    """Return the covered samples, with inverse distance and lit colour of the nearest triangle at each."""
+    local = (triangles.corners - camera.position) @ camera.frame.T
+    near = 1.0 / np.maximum(-local[..., 2], 1e-6)  # the scene is framed in front of the camera
+    focal = height / 2 / np.tan(camera.angle / 2)
+    x, y = width / 2 + focal * local[..., 0] * near, height / 2 - focal * local[..., 1] * near
+    # A value that is linear in space is, divided by its distance, linear on the screen: a x + b y + c.
+    values = np.concatenate([near[..., None], _shade(triangles, camera) * near[..., None]], -1)
+    screen = np.stack([x, y, np.ones_like(x)], -1)
+    seen = np.abs(np.linalg.det(screen)) > 1e-9  # a triangle seen from its edge covers nothing
+    weights, y = np.linalg.inv(screen[seen]), y[seen]  # of the corners, as functions of x, y and 1
+    planes = weights @ values[seen]
+
+    # Sample centres lie at integers + 0.5; in each row a triangle covers those where no weight is negative.
+    owner, row = _ranges(*(np.clip(np.ceil(end - 0.5), 0, height).astype(np.int64) for end in (y.min(1), y.max(1))))
+    slope, rest = weights[owner, 0], weights[owner, 1] * (row + 0.5)[:, None] + weights[owner, 2]
+    zero = -rest / np.where(slope == 0.0, 1.0, slope)
+    begin, end = np.where(slope > 0.0, zero, -np.inf).max(1), np.where(slope < 0.0, zero, np.inf).min(1)
+    tie = 1e-6  # triangles that share an edge both cover a centre on it, so that no crack is left between them
+    begin, end = (np.clip(np.ceil(e - 0.5), 0, width).astype(np.int64) for e in (begin - tie, end + tie))
+    span, column = _ranges(begin, end)
+
+    flat = planes[owner, 1] * (row + 0.5)[:, None] + planes[owner, 2]  # b y + c
+    near = planes[owner, 0, 0][span] * (column + 0.5) + flat[span, 0]
+    sample = row[span] * width + column
+    nearest = np.zeros(height * width)
+    np.maximum.at(nearest, sample, near)
+    first = np.flatnonzero(near == nearest[sample])
+    span, column, near = span[first], column[first], near[first]
+    color = planes[owner[span], 0, 1:] * (column + 0.5)[:, None] + flat[span, 1:]
+    return sample[first], near, color / near[:, None]
+
+
+def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Return all integers of the ranges [begin, end), each with the index of its range."""
+    counts = np.maximum(end - begin, 0)
+    owner = np.repeat(np.arange(len(begin)), counts)
     start = np.cumsum(counts) - counts
-    corner = np.repeat(np.arange(len(at)), counts[at])
-    offset = np.arange(len(corner)) - np.repeat(np.cumsum(counts[at]) - counts[at], counts[at])
-    other = order[start[at[corner]] + offset]
-    near = (flat[corner // 3] * flat[other // 3]).sum(1) > np.cos(np.deg2rad(40.0))
-    sums = np.zeros((len(at), 3))
-    np.add.at(sums, corner[near], weighted[other[near] // 3])
-    return (sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)).reshape(-1, 3, 3)
+    return owner, np.arange(len(owner)) - (start - begin)[owner]
+
+
+def _shade(triangles: Triangles, camera: Camera) -> Float[np.ndarray, "t 3 3"]:
+    """Return the colours of the corners, lit by two lamps fixed to the camera."""
+    ambient, key_strength, fill_strength, shine_strength = 0.52, 0.50, 0.22, 0.08  # chosen by eye, as are the lamps
+    key, fill = (np.array(lamp) / np.linalg.norm(lamp) for lamp in ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60)))
+    normal = triangles.normals @ camera.frame.T
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    normal = np.where(normal[..., 2].sum(1)[:, None, None] < 0.0, -normal, normal)
+    half = key + np.array([0.0, 0.0, 1.0])
+    light = ambient + key_strength * np.maximum(normal @ key, 0.0) + fill_strength * np.maximum(normal @ fill, 0.0)
+    shine = shine_strength * np.maximum(normal @ (half / np.linalg.norm(half)), 0.0) ** 40
+    lit = triangles.lit[:, None]
+    return triangles.colors * np.where(lit, light, 1.0)[..., None] + np.where(lit, shine, 0.0)[..., None]
 
 
 def rgb(color: str) -> tuple[float, float, float]:
     """Return red, green and blue in [0, 1] of a colour "#rrggbb"."""
-    red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    red, green, blue = (x / 255 for x in bytes.fromhex(color[1:]))
     return red, green, blue
 
 
@@ -167,11 +251,10 @@ def map_colors(values: Float[np.ndarray, " n"], name: str) -> Float[np.ndarray, 
     return matplotlib.colormaps[name](values)[:, :3]
 
 
-def draw_bar(image: object, title: str, most: float, colors: str) -> None:
+def draw_bar(image: Any, title: str, most: float, colors: str) -> None:
     """Draw a titled colour bar from 0 to `most` at the bottom of a picture."""
     from PIL import Image, ImageDraw, ImageFont
 
-    assert isinstance(image, Image.Image)
     width, height = image.size
     left, right, top, bottom = width // 5, width - width // 5, height - 24, height - 10
     ramp = map_colors(np.linspace(0.0, 1.0, right - left), colors)
@@ -183,11 +266,8 @@ def draw_bar(image: object, title: str, most: float, colors: str) -> None:
     draw.text(((left + right) / 2, top - 29), title, INK, font, anchor="ms")
 
 
-def encode_png(image: object) -> bytes:
-    """Return a Pillow image as the bytes of a PNG."""
-    from PIL import Image
-
-    assert isinstance(image, Image.Image)
+def encode_png(image: Any) -> bytes:
+    """Return the bytes of a PNG of a Pillow image."""
     buffer = io.BytesIO()
     image.save(buffer, format="PNG", compress_level=4)
     return buffer.getvalue()

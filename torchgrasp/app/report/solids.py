@@ -84,36 +84,24 @@ def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     from trimesh import creation
     from trimesh.transformations import euler_matrix
 
+    ball = np.asarray(creation.icosphere(subdivisions=3 if shape.kind == "sphere" else 1, radius=1.0).vertices)
     if shape.kind == "sphere":
-        ball = creation.icosphere(subdivisions=3, radius=1.0)
-        normals, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
-        points = shape.size[0] * normals
+        radius, centres = shape.size[0], np.zeros((1, 3))
+    elif shape.kind == "box":
+        radius = min(EDGE, min(shape.size) / 4)  # thin plates stay plates
+        centres = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * (np.array(shape.size) / 2 - radius)
     else:
-        centres, normals, radius = _box(shape.size) if shape.kind == "box" else _cylinder(*shape.size)
-        points = centres + radius * normals
-        faces = np.asarray(ConvexHull(points).simplices)
-        a, b, c = points[faces].transpose(1, 0, 2)
-        inward = (np.cross(b - a, c - a) * normals[faces].sum(1)).sum(1) < 0.0
-        faces[inward] = faces[inward, ::-1]
+        radius = min(EDGE, shape.size[0] / 2, shape.size[1] / 4)
+        tilt, turn = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 40, endpoint=False))
+        ball = np.stack([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)], -1)
+        rim, up = (shape.size[0] - radius) * ball[:, 3], np.array([0.0, 0.0, shape.size[1] / 2 - radius])
+        ball, centres = ball.reshape(-1, 3), np.concatenate([rim - up, rim + up])
+    points, normals = (centres[:, None] + radius * ball).reshape(-1, 3), np.tile(ball, (len(centres), 1))
+    hull = ConvexHull(points)
+    kept, faces = np.unique(hull.simplices, return_inverse=True)
+    points, normals, faces = points[kept], normals[kept], faces.reshape(-1, 3)
+    a, b, c = points[faces].transpose(1, 0, 2)
+    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0.0
+    faces[inward] = faces[inward, ::-1]
     place = euler_matrix(*shape.rpy, axes="sxyz")
     return points @ place[:3, :3].T + np.array(shape.xyz), faces, normals @ place[:3, :3].T
-
-
-def _box(size: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return centres, directions and radius of the balls at the corners of a box."""
-    radius = min(EDGE, min(size) / 4)  # thin plates stay plates
-    grid = [ij for ij in itertools.product(range(4), repeat=3) if sum(ij) == 3]  # an octant in steps of 30 degrees
-    octant = np.array(grid) / np.linalg.norm(grid, axis=1, keepdims=True)
-    signs = np.repeat(list(itertools.product((-1.0, 1.0), repeat=3)), len(octant), axis=0)
-    return signs * (np.array(size) / 2 - radius), signs * np.tile(octant, (8, 1)), radius
-
-
-def _cylinder(radius: float, length: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return centres, directions and radius of the balls along the rims of a cylinder."""
-    edge = min(EDGE, min(2.0 * radius, length) / 4)
-    turn, tilt, side = np.meshgrid(
-        np.linspace(0.0, 2 * np.pi, 40, endpoint=False), np.linspace(0.0, np.pi / 2, 4), (-1.0, 1.0)
-    )
-    around = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], -1).reshape(-1, 3)
-    tilt, up = tilt.reshape(-1, 1), side.reshape(-1, 1) * np.array([0.0, 0.0, 1.0])
-    return (radius - edge) * around + (length / 2 - edge) * up, np.cos(tilt) * around + np.sin(tilt) * up, edge
