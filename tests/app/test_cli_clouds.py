@@ -14,15 +14,16 @@ from PIL import Image
 from tests.make import box
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasps
-from torchgrasp.app.cli.inputs import CloudOptions
-from torchgrasp.cloud import look_at, partial_view, read_cloud, save_cloud
+from torchgrasp.app.cli.inputs import CloudOptions, ViewOptions
+from torchgrasp.cloud import look_at, partial_view, read_cloud, read_cloud_file, save_cloud
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.cloud.check import remove_outliers
 from torchgrasp.cloud.tables import read_image
 from torchgrasp.data.shipped import DATA, load_object, load_scene
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, as_plane
-from torchgrasp.scene import read_scene
+from torchgrasp.scene import Scene, read_scene
+from torchgrasp.scene.image import DepthImage
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
 
@@ -253,7 +254,7 @@ def test_cut_leaves_the_thing_at_the_point_without_the_table(tmp_path, capsys):
             assert float((of_ball == (wanted == "ball")).double().mean()) > 0.99
             assert len(thing) > 300 and float(points[:, 2].min()) < 0.03
             assert cli.main(["cloud", "check", str(tmp_path / "b.npz"), *up]) == 0
-    plane = capsys.readouterr().out.split("--table ")[-1].split()[:4]
+    plane = capsys.readouterr().out.split("table   --table ")[-1].split()[:4]
     assert np.allclose(np.array(plane, dtype=float), [0, 1, 0, 0], atol=0.003)
     assert cli.main(["cloud", "cut", path, "--out", str(tmp_path / "c.npz"), "--box", *"778899"]) == 2
     assert "0 points in the box" in capsys.readouterr().err and not (tmp_path / "c.npz").exists()
@@ -511,3 +512,83 @@ def test_a_flying_pixel_below_the_table_is_not_where_the_table_is(up):
     found = [as_plane(view.plane(cloud)) for cloud in (seen, flying)]
     assert found[0].offset == found[1].offset and abs(found[0].offset) < 0.01
     assert as_plane(CloudOptions(up=up, table=(-0.03,)).plane(flying)).offset == -0.03
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".ply"])
+def test_the_table_that_cut_names_is_that_of_the_next_commands(suffix, tmp_path, run_command, monkeypatch):
+    scene, cut, thin = str(write(tmp_path / "scene.npz", with_table(0.5))), tmp_path / f"a{suffix}", tmp_path / "b.npz"
+    words = run_command("cloud", "cut", scene, "--out", cut)[1].split("table   --table ")[1].split()
+    named = [float(word) for word in words[:4]]
+    assert str(cut) in " ".join(words)
+    assert run_command("cloud", "thin", cut, "--out", thin)[0] == 0
+    planned = []
+    monkeypatch.setattr(
+        grasps, "plan_grasps", lambda cloud, hand, spec, *_, **__: planned.append(spec.table) or exit(9)
+    )
+    for path, options, offset in ((cut, [], named[3]), (thin, [], named[3]), (cut, ["--table", "-0.02"], -0.02)):
+        planned.clear()
+        assert "the file holds a table" in run_command("cloud", "check", path)[1]
+        with pytest.raises(SystemExit):
+            run_command("grasp", path, "--out", tmp_path / "out", "--hand", "barrett", *options)
+        assert abs(as_plane(planned[0]).offset - offset) < 1e-4
+    file = read_cloud_file(cut)
+    assert file.table is not None and np.allclose([*file.table.components, file.table.offset], named, atol=1e-4)
+    np.savetxt(tmp_path / "pose.txt", np.diag([1.0, -1.0, -1.0, 1.0]))
+    moved = ViewOptions(camera_pose=tmp_path / "pose.txt", unit="mm").read(
+        "CLOUD",
+        save_cloud(PointCloud(100 * torch.rand(50, 3) + torch.tensor([0, 0, 900.0])), thin, Plane.horizontal(7.0)),
+    )
+    assert moved.table is not None and np.allclose([*moved.table.components, moved.table.offset], [0, 0, -1, 0.007])
+
+
+def test_a_cloud_gives_a_scene_as_its_depth_image_does(tmp_path, run_command):
+    meshes, pose = [box([0.06, 0.06, 0.1], (0.0, 0.0)), box([0.05, 0.08, 0.06], (0.1, 0.12))], look_at(40.0, 45.0, 0.7)
+    depth, k = (
+        render_depth(meshes, pose)[0][::2, ::2].clone(),
+        torch.diag(torch.tensor([0.5, 0.5, 1])).double() @ INTRINSICS,
+    )
+    camera = Scene.from_depth(depth, k)
+    rows = torch.where((depth > 0)[..., None], DepthImage(depth, k, torch.eye(4).double()).points(), torch.nan)
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 320\nHEIGHT 240\nVIEWPOINT 0 0 0 1 0 0 0\nDATA binary\n"
+    (tmp_path / "a.pcd").write_bytes(head.encode() + rows.numpy().astype("<f4").tobytes())
+    seen = PointCloud(camera.points, None, torch.zeros(3).double())
+    save_cloud(seen, tmp_path / "b.ply")
+    save_cloud(PointCloud(1000 * seen.points), tmp_path / "c.npz")
+    np.savetxt(tmp_path / "pose.txt", pose.numpy())
+    point = camera.cloud(2).points[0].tolist()
+    for name, options in (
+        ("a.pcd", []),
+        ("a.pcd", ["--point", *point]),
+        ("b.ply", ["--up", *pose[2, :3].tolist()]),
+        ("c.npz", ["--unit", "mm", "--viewpoint", 0, 0, 0]),
+        ("b.ply", ["--camera-pose", tmp_path / "pose.txt"]),
+    ):
+        code, said, error = run_command("cloud", "scene", tmp_path / name, *options, "--out", tmp_path / "s.npz")
+        found = read_scene(tmp_path / "s.npz")
+        assert code == 0 and "object 2" in said, error
+        assert len(found.things) == len(camera.things) and not found.image.bounded and (tmp_path / "s.png").is_file()
+        assert (found.target is not None) == ("--point" in options)
+        height = found.table.height(found.viewpoint) if found.table is not None else 0
+        assert abs(float(height) - float(pose[2, 3])) < 0.004
+
+
+NO_SCENE = {
+    "an image without intrinsics": ("d.png", [], "--intrinsics: expected fx fy cx cy"),
+    "a scene's file": ("e.npz", [], "--intrinsics: expected fx fy cx cy"),
+    "a cloud without a camera": ("f.npy", [], "--viewpoint: expected the position of the one camera"),
+    "a mask": ("f.npy", ["--mask", "m.png"], "--mask: expected --point"),
+    "a unit of depth": ("f.npy", ["--depth-unit", "0.001"], "--depth-unit: expected"),
+    "a pixel": ("f.npy", ["--point", "3", "4"], "--point: expected x y z"),
+    "no cloud": ("g.pcd", [], "DEPTH: expected a well-formed .pcd file"),
+    "a viewpoint of an image": ("d.png", [*K, "--viewpoint", "0", "0", "0"], "--intrinsics: expected --camera-pose"),
+}
+
+
+@pytest.mark.parametrize("name", NO_SCENE)
+def test_a_cloud_that_gives_no_scene_is_refused_in_one_sentence(name, tmp_path, refusal):
+    file, options, words = NO_SCENE[name]
+    Image.fromarray(np.ones((9, 9), dtype=np.uint16)).save(tmp_path / "d.png")
+    np.savez(tmp_path / "e.npz", depth=np.ones((9, 9)), intrinsics=np.eye(3))
+    np.save(tmp_path / "f.npy", np.random.default_rng(0).random((90, 3)))
+    (tmp_path / "g.pcd").write_bytes(b"x")
+    assert refusal("cloud", "scene", tmp_path / file, *options, "--out", tmp_path / "s.npz").startswith(words)

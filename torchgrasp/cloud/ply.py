@@ -17,13 +17,13 @@ TYPES = {
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals, viewpoint and frustum of a PLY file, or None for what it lacks.
+    """Return points, normals, viewpoint, frustum and table of a PLY file, or None for what it lacks.
 
     Raises:
         ValueError: no PLY file; fewer bytes than the header promises.
     """
     header, body = _split_header(data)
-    encoding, viewpoint, frustum = "", None, None
+    encoding, viewpoint, frustum, table = "", None, None, None
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     for line in header:
         match line.split():
@@ -33,6 +33,8 @@ def parse_ply(data: bytes) -> dict[str, Any]:
                 viewpoint = np.array([float(x), float(y), float(z)])
             case ["comment", "frustum", *numbers] if len(numbers) == 12:
                 frustum = np.array([float(x) for x in numbers]).reshape(4, 3)
+            case ["comment", "table", *numbers] if len(numbers) == 4:
+                table = np.array([float(x) for x in numbers])
             case ["element", name, count]:
                 elements.append((name, int(count), []))
             case ["property", "list", _, _, name] if elements:
@@ -58,7 +60,7 @@ def parse_ply(data: bytes) -> dict[str, Any]:
     columns = _read_columns(body, encoding, count, properties)
     points = np.stack([columns[name] for name in "xyz"], axis=-1)
     normals = np.stack([columns[f"n{axis}"] for axis in "xyz"], axis=-1) if "nx" in columns else None
-    return {"points": points, "normals": normals, "viewpoint": viewpoint, "frustum": frustum}
+    return {"points": points, "normals": normals, "viewpoint": viewpoint, "frustum": frustum, "table": table}
 
 
 def format_ply(
@@ -66,17 +68,18 @@ def format_ply(
     normals: np.ndarray | None = None,
     viewpoint: np.ndarray | None = None,
     frustum: np.ndarray | None = None,
+    table: np.ndarray | None = None,
 ) -> bytes:
-    """Return a binary PLY file. Comment lines hold the viewpoint and the sides of its view."""
+    """Return a binary PLY file. Comment lines hold the viewpoint, the sides of its view, and the table."""
     lines = ["ply", "format binary_little_endian 1.0"]
-    for name, numbers in (("viewpoint", viewpoint), ("frustum", frustum)):
+    for name, numbers in (("viewpoint", viewpoint), ("frustum", frustum), ("table", table)):
         if numbers is not None:
             lines.append(f"comment {name} " + " ".join(repr(float(x)) for x in numbers.flat))
     lines.append(f"element vertex {len(points)}")
     names = ["x", "y", "z"] + (["nx", "ny", "nz"] if normals is not None else [])
     lines += [f"property float {name}" for name in names]
-    table = points if normals is None else np.concatenate([points, normals], axis=1)
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + table.astype("<f4").tobytes()
+    rows = points if normals is None else np.concatenate([points, normals], axis=1)
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.astype("<f4").tobytes()
 
 
 def _split_header(data: bytes) -> tuple[list[str], bytes]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,7 @@ from torchgrasp.cloud.tables import parse_npy, parse_npz, read_lines
 from torchgrasp.cloud.viewpoint import can_see
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.files import is_file, read_bytes, write_file
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 from torchgrasp.values import PointCloud
 
@@ -40,6 +42,7 @@ class CloudFile(Value):
 
     cloud: PointCloud
     notes: tuple[str, ...]
+    table: Plane | None = None  # that the file holds, as `save_cloud` writes it
 
 
 @checked
@@ -49,11 +52,11 @@ def read_cloud(
     """Read the point cloud of one object, in float64; `read_cloud_file` also reports what was left out.
 
     * `.ply`, ascii or binary: x y z, optionally nx ny nz; header lines `comment viewpoint x y z` and
-      `comment frustum` with 12 numbers give the camera.
+      `comment frustum` with 12 numbers give the camera, `comment table` with 4 the table.
       A mesh gives 2000 surface points, with normals if it is closed.
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; VIEWPOINT gives the camera.
       Its default `0 0 0 1 0 0 0` counts only if the points look like those of a camera in the origin.
-    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,) and `frustum` (4, 3);
+    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4, 3), `table` (4,);
       of several views `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`, `.xyz`, `.txt`, `.csv` (text): an (n, 3) array, or (n, 6) with normals; colours are left out.
 
@@ -100,9 +103,9 @@ def read_cloud_file(
     parsers = {
         ".ply": parse_ply,
         ".pcd": parse_pcd,
-        ".npz": lambda data: parse_npz(data, ("points", "normals", "viewpoint", "frustum"), "points"),
-        ".npy": lambda data: {"table": parse_npy(data)},
-        **dict.fromkeys((".xyz", ".txt", ".csv"), lambda data: {"table": read_lines(data)}),
+        ".npz": lambda data: parse_npz(data, ("points", "normals", "viewpoint", "frustum", "table"), "points"),
+        ".npy": lambda data: {"columns": parse_npy(data)},
+        **dict.fromkeys((".xyz", ".txt", ".csv"), lambda data: {"columns": read_lines(data)}),
     }
     if suffix not in parsers:
         raise CloudFileError("path", path, "a file ending in .ply, .pcd, .npz, .npy, .xyz, .txt or .csv")
@@ -134,13 +137,13 @@ def cloud_from_array(
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
     48
     """
-    arrays = {"table" if normals is None else "points": points, "normals": normals, "viewpoint": viewpoint}
+    arrays = {"columns" if normals is None else "points": points, "normals": normals, "viewpoint": viewpoint}
     return check_cloud(make_cloud("an array", arrays).cloud)
 
 
 @checked
-def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
-    """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically.
+def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) -> Path:
+    """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically; `read_cloud_file` also reads the table.
 
     Raises:
         BadArgument: another suffix; several views for `.ply`, which has one viewpoint.
@@ -152,6 +155,7 @@ def save_cloud(cloud: PointCloud, path: Path | str) -> Path:
     """
     path, buffer = Path(path), io.BytesIO()
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
+    arrays |= {} if table is None else {"table": np.array([*table.components, table.offset])}
     if path.suffix.lower() not in (".npz", ".ply"):
         raise BadArgument("path", path, "a file ending in .npz or .ply")
     if path.suffix.lower() == ".npz":
@@ -167,8 +171,8 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
 
     Args:
         source: name of the file in errors.
-        arrays: "points" (n, 3) or (h, w, 3), or "table" with 3 or 6 columns; optionally "normals", "viewpoint" and
-            its "frustum".
+        arrays: "points" (n, 3) or (h, w, 3), or 3 or 6 "columns"; optionally "normals", "viewpoint" and its "frustum",
+            and the "table" as normal and offset.
         viewpoint: the camera [m], instead of the arrays' viewpoint.
         scale: metres in a unit of the arrays.
 
@@ -178,7 +182,7 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
         TooFewPoints: fewer than 4 rows are left.
     """
     notes: list[str] = []
-    if "table" in arrays:
+    if "columns" in arrays:
         arrays = _split_columns(source, arrays, notes)
     points = scale * _as_rows(source, "points", arrays["points"])
     normals = None if arrays.get("normals") is None else _as_rows(source, "normals", arrays["normals"])
@@ -202,21 +206,26 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
     if viewpoint is not None and viewpoint.ndim == 2:
         viewpoint = viewpoint[keep]
     if frustum is not None:
-        frustum = _as_sides(source, frustum, len(points))
+        frustum = _as_numbers(source, "frustum", frustum, (4, 3), (len(points), 4, 3))
         frustum = frustum if frustum.ndim == 2 else frustum[keep]
     cloud = PointCloud(points[keep], None if normals is None else normals[keep], viewpoint, frustum)
     if default:
         cloud = _judge_default(cloud, notes)
-    return CloudFile(cloud, tuple(notes))
+    table = arrays.get("table")
+    if table is not None:
+        *normal, offset = _as_numbers(source, "table", table, (4,)).tolist()
+        if not abs(math.hypot(*normal) - 1) < 1e-4:
+            raise CloudFileError("path", f"{source}: a table with the normal {normal}", "a unit vector")
+        table = Plane(torch.tensor(normal, dtype=torch.float64), scale * offset)
+    return CloudFile(cloud, tuple(notes), table)
 
 
-def _as_sides(source: str, array: Any, n: int) -> Tensor:
-    """Return the normals of a frustum, or refuse its file."""
+def _as_numbers(source: str, name: str, array: Any, *shapes: tuple[int, ...]) -> Tensor:
+    """Return finite numbers of one of the shapes, or refuse their file."""
     array = np.asarray(array)
-    if array.dtype.kind not in "fiu" or array.shape not in ((4, 3), (n, 4, 3)) or not np.isfinite(array).all():
-        raise CloudFileError(
-            "path", f"{source}: a frustum of shape {array.shape}", "finite numbers of shape (4, 3), or (n, 4, 3)"
-        )
+    if array.dtype.kind not in "fiu" or array.shape not in shapes or not np.isfinite(array).all():
+        allowed = f"finite numbers of shape {' or '.join(map(str, shapes))}"
+        raise CloudFileError("path", f"{source}: a {name} of shape {array.shape}", allowed)
     return torch.from_numpy(array.astype(np.float64))
 
 
@@ -239,7 +248,7 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
 
 def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dict[str, Any]:
     """Split a table of 3 or 6 columns into points and normals; columns of colours are left out."""
-    table = np.asarray(arrays["table"])
+    table = np.asarray(arrays["columns"])
     if table.ndim not in (2, 3) or table.shape[-1] not in (3, 6) or table.dtype.kind not in "fiu":
         found = f"{source}: an array of shape {table.shape} and type {table.dtype}"
         raise CloudFileError(

@@ -33,12 +33,12 @@ def read_scene(path: Path | str) -> Scene:
     """
     arrays = read_arrays(Path(path))
     table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
-    others = arrays.pop("others", np.empty((0, 4)))
+    others, bounded = arrays.pop("others", np.empty((0, 4))), bool(arrays.pop("bounded", True))
     plane, *rest = (
         (Plane(torch.tensor(row[:3]), float(row[3])) for row in [table, *others]) if table is not None else [None]
     )
     scene = Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
-    scene = dataclasses.replace(scene, others=tuple(rest)) if rest else scene
+    scene = dataclasses.replace(scene, others=tuple(rest), image=dataclasses.replace(scene.image, bounded=bounded))
     return scene if target is None else scene.select(int(target))
 
 
@@ -65,6 +65,7 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
         "intrinsics": scene.image.intrinsics.cpu().numpy(),
         "camera_pose": scene.image.obj_from_camera.cpu().numpy(),
         "labels": labels,
+        "bounded": np.array(scene.image.bounded),
     }
     if scene.table is not None:
         arrays["table"] = np.array([*scene.table.normal.tolist(), scene.table.offset])

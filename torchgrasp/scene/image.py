@@ -131,12 +131,19 @@ def image_of_cloud(
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays of a scene's .npz file; the table as 4 floats, the target and the unit as numbers.
+    """Return the arrays of a scene's .npz file; table and others as floats, target, unit and `bounded` as numbers.
 
     Raises:
         CloudFileError: no such file, or malformed content.
     """
-    names = ("depth", "intrinsics", "camera_pose", "labels", "mask", "table", "others", "target", "depth_unit")
+    typed = {
+        "table": (float, 4),
+        "others": (float, (-1, 4)),
+        "depth_unit": (float, ()),
+        "target": (np.int64, ()),
+        "bounded": (bool, ()),
+    }
+    names = ("depth", "intrinsics", "camera_pose", "labels", "mask", *typed)
     allowed = "a .npz file with depth and intrinsics"
     if path.suffix.lower() != ".npz" or not is_file(path):
         raise CloudFileError("path", path, allowed)
@@ -145,14 +152,9 @@ def read_arrays(path: Path) -> dict[str, Any]:
     try:
         arrays = parse_npz(read_bytes(path), names, "depth")
         found = {name: arrays[name] for name in ("depth", "intrinsics")} | arrays
-        if "table" in found:
-            found["table"] = found["table"].astype(float).reshape(4)
-        if "others" in found:
-            found["others"] = found["others"].astype(float).reshape(-1, 4)
-        if "depth_unit" in found:
-            found["depth_unit"] = found["depth_unit"].astype(float).reshape(()).item()
-        if "target" in found:
-            found["target"] = found["target"].astype(np.int64, casting="safe").reshape(())
+        for name in typed.keys() & found.keys():
+            kind, shape = typed[name]
+            found[name] = found[name].astype(kind, casting="safe").reshape(shape)[()]
     except BadArgument:
         raise
     except Exception as error:  # zlib, zipfile and numpy each raise their own

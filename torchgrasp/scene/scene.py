@@ -211,7 +211,8 @@ class Scene(Value):
             for plane in self.others
         ]
         pixels, last = self.pixels[self.rows_of()], torch.tensor(self.image.depth.shape) - 1
-        if int(((pixels <= 1) | (pixels >= last - 1)).any(-1).sum()) >= 5:  # fewer are noise
+        at_border = ((pixels <= 1) | (pixels >= last - 1)).any(-1)
+        if self.image.bounded and int(at_border.sum()) >= 5:  # fewer are noise
             found.append(
                 "the target is cut off at the border of the image: its other part is unknown; turn the camera to it"
             )

@@ -49,10 +49,11 @@ class CloudCheck(Command):
     def run(self) -> int:
         """Check the cloud and print the report; return the exit code."""
         file = self.view.read("FILE", find_cloud(self.file, "FILE"), whole=True)
-        plane = as_plane(self.view.plane(file.cloud))
-        up = self.view.given_vertical(plane)
-        known = plane if self.view.table is not None else None
-        report = diagnose_cloud(file.cloud, up, known, stands=not self.view.no_table)
+        view = self.view.with_table_of(file)
+        plane = as_plane(view.plane(file.cloud))
+        up = view.given_vertical(plane)
+        known = plane if view.table is not None else None
+        report = diagnose_cloud(file.cloud, up, known, stands=not view.no_table)
         print(format_report(report))
         for note in file.notes:
             print(f"{'note':12}{note}")
@@ -77,7 +78,7 @@ def _no_view(cloud: PointCloud) -> BadArgument | None:
 
 @arguments(points="cloud", path="out")
 class CloudCut(Command):
-    """Write the points of one object in a scene, without the plane below it."""
+    """Write the points of one object in a scene without the table, and beside them where the table is."""
 
     cloud: Path = positional("point cloud of a scene of any size (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv)")
     out: Path = required(OUT_CLOUD_HELP)
@@ -99,13 +100,13 @@ class CloudCut(Command):
         up = self.view.vertical
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if up is None else up
         thing, plane = cut_object(file.cloud, up, near, None if corners is None else corners.reshape(2, 3), self.gap)
-        save_cloud(thing, self.out)
+        save_cloud(thing, self.out, plane)
         print_notes(file.notes)
         if plane is None:
             print("note    no plane was found under the object")
         else:
             x, y, z = plane.normal.tolist()
-            print(f"plane   --table {x:.5f} {y:.5f} {z:.5f} {plane.offset:.5f}")
+            print(f"table   --table {x:.5f} {y:.5f} {z:.5f} {plane.offset:.5f} ({self.out} holds it)")
         print(f"{len(thing)} of {len(file.cloud)} points, {self.out}")
         return 0
 
@@ -124,7 +125,7 @@ class CloudThin(Command):
         file = self.view.read("CLOUD", self.cloud, whole=True)
         some = voxel_downsample(file.cloud, self.voxel)
         less = remove_outliers(some)
-        save_cloud(less, self.out)
+        save_cloud(less, self.out, file.table)
         print_notes(file.notes)
         print(f"{len(less)} of {len(file.cloud)} points, {len(some) - len(less)} outliers removed, {self.out}")
         return 0
@@ -188,7 +189,7 @@ class ShapeSurface(Command):
         """Fit the shape and write its surface as a mesh; return the exit code."""
         check_surface_path(self.out)
         file = self.view.read("CLOUD", find_cloud(self.cloud))
-        table = self.view.plane(file.cloud)
+        table = self.view.with_table_of(file).plane(file.cloud)
         with naming(table="--table"):
             shape = fit_shape(file.cloud, support=self.support, seed=self.seed, table=table)
         estimate = extract_surface(shape, self.resolution)

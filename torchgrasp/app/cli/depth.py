@@ -1,9 +1,11 @@
-"""`torchgrasp cloud depth` and `torchgrasp cloud scene`: a cloud or a scene from a depth image."""
+"""`torchgrasp cloud depth` and `torchgrasp cloud scene`: a cloud or a scene from a depth image, a scene of a cloud."""
 
+import dataclasses
 from pathlib import Path
+from typing import Literal
 
 from torchgrasp.app.cli.command import Command, arguments, option, positional, required
-from torchgrasp.app.cli.inputs import OUT_CLOUD_HELP, read_table
+from torchgrasp.app.cli.inputs import OUT_CLOUD_HELP, ViewOptions, read_table
 from torchgrasp.app.report.scene import draw_scene
 from torchgrasp.cloud import cloud_from_depth, save_cloud
 from torchgrasp.cloud.pose import read_pose
@@ -11,21 +13,26 @@ from torchgrasp.cloud.sensor import median_depth
 from torchgrasp.cloud.tables import read_image, read_intrinsics
 from torchgrasp.errors import BadArgument
 from torchgrasp.scene import Scene, save_scene
+from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.masks import read_labels, read_mask
+
+
+DEPTH_HELP = (
+    'image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, or .npz with an array "depth"): integers are '
+    "millimetres, floats metres; 0 and NaN are not measured"
+)
+INTRINSICS_HELP = (
+    "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height; or a file of ROS, Open3D, "
+    "RealSense, Zivid or BOP (.json, .yaml), or with a matrix (.npy, .txt)"
+)
 
 
 @arguments(points="depth", path="out")
 class _DepthCommand(Command):
     """The arguments of commands that read a depth image."""
 
-    depth: Path = positional(
-        'image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, or .npz with an array "depth"): integers are '
-        "millimetres, floats metres; 0 and NaN are not measured"
-    )
-    intrinsics: tuple[str, ...] = required(
-        "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height; or a file of ROS, "
-        "Open3D, RealSense, Zivid or BOP (.json, .yaml), or with a matrix (.npy, .txt)"
-    )
+    depth: Path = positional(DEPTH_HELP)
+    intrinsics: tuple[str, ...] = required(INTRINSICS_HELP)
     depth_unit: float | None = option(
         None, "metres of one count of the depth: 0.0001 of a RealSense D405, 0.00025 of an L515, 0.001 of float mm"
     )
@@ -81,32 +88,36 @@ class CloudDepth(_DepthCommand):
         return 0
 
 
-@arguments(labels="mask")
+@arguments(labels="mask", cloud="depth")
 class CloudScene(_DepthCommand):
-    """Write the scene of a depth image for `torchgrasp grasp`: the table and the objects on it; and its picture.
+    """Write the scene of a depth image or a cloud for `torchgrasp grasp`: table and objects; and its picture.
 
     See docs/real_camera.md.
     """
 
+    depth: Path = positional(f"{DEPTH_HELP}; or, without --intrinsics, a cloud of one view (.pcd, .ply, .npz, .npy)")
+    intrinsics: tuple[str, ...] = option((), INTRINSICS_HELP)
+    viewpoint: tuple[float, float, float] | None = option(
+        None, "position of the camera [m] in the frame of the cloud; by default the file's"
+    )
+    unit: Literal["m", "cm", "mm"] = option("m", "unit of the numbers in the file of a cloud")
     out: Path = required("scene to write (.npz); beside it a .png shows the table, objects and obstacles")
     table: tuple[float, ...] | None = option(
         None, "height z of the table, or four numbers nx ny nz d of the plane n . p = d [m]; by default it is found"
     )
     up: tuple[float, float, float] | None = option(None, "roughly against gravity, in the frame of the results")
-    point: tuple[float, float] | None = option(None, "column and row of a pixel on the target")
+    point: tuple[float, ...] | None = option(
+        None, "column and row of a pixel on the target, or x y z [m] of a point on it"
+    )
 
     def run(self) -> int:
         """Find the table and the objects, write the scene and its picture; return the exit code."""
         picture = self.out.with_suffix(".png")
         if picture.resolve() in [path.resolve() for path in (self.depth, self.mask, *self.frames) if path]:
             raise BadArgument("--out", f"{self.out}, whose picture would replace {picture}", "another name")
-        depth, camera, mask, pose = self.images()
         if self.up is not None and not any(self.up):
             raise BadArgument("--up", "a vector of length zero", "the direction that points up")
-        table = None if self.table is None else read_table(self.table)
-        chosen = "mask" if mask is None or len(mask[mask > 0].unique()) < 2 else "labels"
-        given = {"point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit, chosen: mask}
-        seen = Scene.from_depth(depth, camera, pose, **given)
+        seen = self._of_image() if self.intrinsics else self._of_cloud()
         save_scene(seen, self.out)
         draw_scene(seen, picture)
         for label in seen.things:
@@ -119,3 +130,28 @@ class CloudScene(_DepthCommand):
         said += [f"note: {sentence}" for sentence in seen.notes] + [f"advice: {sentence}" for sentence in seen.advice]
         print(*said, f"{self.out}, {picture}", sep="\n")
         return 0
+
+    def _of_image(self) -> Scene:
+        """Return the scene of a depth image."""
+        if self.viewpoint is not None or self.unit != "m":
+            raise BadArgument("--intrinsics", "--viewpoint or --unit beside it", "--camera-pose or --depth-unit")
+        depth, camera, mask, pose = self.images()
+        table = None if self.table is None else read_table(self.table)
+        chosen = "mask" if mask is None or len(mask[mask > 0].unique()) < 2 else "labels"
+        given = {"point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit, chosen: mask}
+        return Scene.from_depth(depth, camera, pose, **given)
+
+    def _of_cloud(self) -> Scene:
+        """Return the scene of a cloud."""
+        if self.depth.suffix.lower() in (".png", ".tif", ".tiff", ".exr") or is_scene(self.depth):
+            raise BadArgument("--intrinsics", "none", "fx fy cx cy of the depth image, or a file")
+        for name, given in (("mask", self.mask), ("frames", self.frames), ("depth-unit", self.depth_unit)):
+            if given:
+                raise BadArgument(f"--{name}", "an option of depth images beside a cloud", "--point X Y Z, or --unit")
+        if self.point is not None and len(self.point) != 3:
+            raise BadArgument("--point", f"{len(self.point)} numbers", "x y z [m] of a point in the cloud")
+        view = ViewOptions(viewpoint=self.viewpoint, unit=self.unit, camera_pose=self.camera_pose)
+        file = view.read("DEPTH", self.depth, whole=True)
+        table = file.table if self.table is None else read_table(self.table)
+        seen = Scene.from_cloud(file.cloud, point=self.point, table=table, up=self.up)
+        return dataclasses.replace(seen, notes=(*file.notes, *seen.notes))

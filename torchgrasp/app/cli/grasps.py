@@ -119,20 +119,21 @@ class Grasp(Command):
         """Plan on a point cloud and write the results; return the exit code."""
         mesh = self._true_mesh(path)
         file = self.view.read("CLOUD", path)
-        cloud, table = file.cloud, self.view.plane(file.cloud)
+        view = self.view.with_table_of(file)
+        cloud, table = file.cloud, view.plane(file.cloud)
         make = ContactSpec.paper if self.mode == "paper" else ContactSpec
         spec, trial = make(friction=self.friction, table=table), TrialSpec(friction=self.friction)
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
-        print_notes(file.notes, self.view.judge(cloud, table))
+        print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
             check_mesh(cloud, true_mesh, "--mesh")
-            plane = None if self.view.table is None else as_plane(table)
+            plane = None if view.table is None else as_plane(table)
             if plane is not None:
                 check_stand(true_mesh, plane, "--mesh")
         progress = Progress(*["fingers"] * (among is not None), *STAGES, *["closing"] * self.close, "report")
         with progress.bar, holding("--out", out):
             origin = "no table" if table is None else describe_table(table)
-            origin += " (lowest point)" * (table is not None and self.view.table is None)
+            origin += " (lowest point)" * (table is not None and view.table is None)
             camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
             progress.end("cloud", f"{len(cloud)} points, {camera}, {origin}")
             options = {"fingers": among, "mode": self.mode, "observer": progress.end}

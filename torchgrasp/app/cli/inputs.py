@@ -1,6 +1,7 @@
 """Arguments that several commands share: reading of cloud files, the table, the hand, and output folders."""
 
 import contextlib
+import dataclasses
 import importlib
 import importlib.util
 import re
@@ -72,20 +73,23 @@ class ViewOptions:
             raise BadArgument("--viewpoint", "--no-viewpoint or --camera-pose beside it", "one of them")
         with naming(path=name, points=name, normals=name, viewpoint="--viewpoint"):
             file = read_cloud_file(path, self.viewpoint, self.unit)
-            cloud, notes = file.cloud, file.notes
+            cloud, notes, table = file.cloud, file.notes, file.table
             if self.no_viewpoint:
                 cloud = PointCloud(cloud.points, cloud.normals)
             if self.no_normals:
                 cloud = PointCloud(cloud.points, None, cloud.viewpoint, cloud.frustum)
             if self.camera_pose is not None:
-                cloud = _move(name, cloud, read_pose("--camera-pose", self.camera_pose))
+                pose = read_pose("--camera-pose", self.camera_pose)
+                cloud, table = _move(name, cloud, pose), table and table.moved(pose)
                 notes = tuple(note for note in notes if "default viewpoint" not in note)
             if not whole:
                 check_cloud(cloud)
                 if len(cloud) > MOST_POINTS:
                     notes = (*notes, f"{MOST_POINTS} of {len(cloud)} points, drawn at random, are used")
                     cloud = cloud.select(draw_rows(len(cloud), MOST_POINTS))
-        return CloudFile(cloud, notes)
+        if table is not None:
+            notes = (*notes, f"the file holds a {describe_table(table)}, which --table or --no-table replaces")
+        return CloudFile(cloud, notes, table)
 
 
 @arguments()
@@ -95,9 +99,15 @@ class CloudOptions(ViewOptions):
     table: tuple[float, ...] | None = option(
         None,
         "height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d [m]; by default the "
-        "table is at the lowest point of the cloud that is no outlier",
+        "file's, as `cloud cut` writes it, else at the lowest point of the cloud that is no outlier",
     )
     no_table: bool = option(False, "there is no table")
+
+    def with_table_of(self, file: CloudFile) -> "CloudOptions":
+        """Return the options with the table that a file holds, unless the user gave one or none."""
+        if file.table is None or self.table is not None or self.no_table:
+            return self
+        return dataclasses.replace(self, table=(*file.table.components, file.table.offset))
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
         """Return the table as a plane, as a height [m] along z, or None."""
