@@ -16,7 +16,6 @@ from torchgrasp.scene import Scene, save_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.masks import read_labels, read_mask
 
-
 DEPTH_HELP = (
     'image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, or .npz with an array "depth"): integers are '
     "millimetres, floats metres; 0 and NaN are not measured"
