@@ -1,13 +1,12 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-close  misplaced, sensors, perturb, grip, holding, agreement, speed, success: closing and lifting in simulation
+close  misplaced, sensors, perturb, holding, speed, success: closing and lifting in simulation
 gpu    kernels: every kernel of the chain on a GPU beside the CPU
-grasp  lifts, pulls: from one noisy view to a held object, for every object of a folder
-hand   fk, collision, samples, codes, em, mae, queries: kinematics, learned model and inverse kinematics
+hand   fk, collision, codes: kinematics beside pytorch-kinematics, self-collision and inverse kinematics
 load   plans, trials, points, starts: memory over many plans and trials, and of large inputs
 plan   truth, fields, executable, certificates: the contact planner on the true surface and in exact arithmetic
-scene  plane, click, rooms, frames, clutter, clear: depth images, random frames, lifts among neighbours
+scene  plane, click, rooms, whole, clutter, clear: depth images, and lifts among neighbours
 shape  objects, weaker: the estimated shape against true meshes
 
 Each bench prints rows, and writes them as JSON and as a Markdown table with commit, machine and command. Times are for
@@ -19,7 +18,7 @@ from collections.abc import Callable
 import tyro
 from benchmarks.common import Options, measure
 
-SUBJECTS = ("close", "gpu", "grasp", "hand", "load", "plan", "scene", "shape")
+SUBJECTS = ("close", "gpu", "hand", "load", "plan", "scene", "shape")
 
 
 def command(subject: str) -> Callable[[Options], None]:

@@ -2,11 +2,9 @@
 
 The best grasp of one view of each object is lifted with every holding and friction. Static analysis at the contacts
 there are when the hand has pressed says whether its drives could hold the object, and at the end what would suffice.
-Plans and lifts are kept as files.
 """
 
 import dataclasses
-import json
 import math
 import statistics
 from collections import Counter
@@ -17,25 +15,22 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
-from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
+from paper.tables6_7 import format_points
+from paper.trials import Subject, TableSpec, subjects
 from scipy.optimize import linprog
 from torch import Tensor
 
-from benchmarks.close.household import HOUSEHOLD, plan_view, read_solid, table_spec
+from benchmarks.close.campaign import keep, plan_view, read_solid, run_all, table_spec
+from benchmarks.close.household import HOUSEHOLD
 from benchmarks.common import Options, Row, bench
-from benchmarks.perturb import household_mass
 from torchgrasp.closure import ClosureResult
 from torchgrasp.control.tactile import joint_jacobian
-from torchgrasp.data import list_views, read_entry
-from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import close_hand
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
 from torchgrasp.evaluation.protocols import seed_of
-from torchgrasp.files import format_json, write_file
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.jobs import run_tasks
 
 FRICTIONS = (0.4, 0.7, 1.0)
 """Frictions that the hand does not know."""
@@ -56,11 +51,7 @@ def holding(o: Options) -> list[Row]:
     spec, rows = table_spec(o), list[Row]()
     for hand in spec.hands:
         tasks = [(spec, subject, hand) for subject in subjects(spec)]
-        lifts: list[dict[str, Any]] = []
-        for task, found in zip(tasks, run_tasks(hold_object, tasks, spec.workers, CELL_SECONDS), strict=True):
-            if isinstance(found, Status):
-                raise SystemExit(f"{task[1].name} {hand}: {found.sentence}")
-            lifts += found
+        lifts = [lift for found in run_all(hold_object, tasks, spec.workers) for lift in found]
         base = [x for x in lifts if x["holding"] == "force"]
         rows += [_row(hand, name, [x for x in lifts if x["holding"] == name], base) for name in HOLDINGS]
     return rows
@@ -68,25 +59,15 @@ def holding(o: Options) -> list[Row]:
 
 def hold_object(spec: TableSpec, subject: Subject, hand: str) -> list[dict[str, Any]]:
     """Return the lifts of one object, kept or run."""
-    torch.set_num_threads(1)
     path = spec.kept("holding", f"{hand}_{subject.label}", HOLDINGS, FRICTIONS, HOLD_TIME).with_suffix(".json")
-    if not path.is_file():
-        write_file(path, format_json(list(_lift(spec, subject, hand))))
-    return json.loads(path.read_text("utf-8"))
+    return keep(path, lambda: list(_lift(spec, subject, hand)))
 
 
 def _lift(spec: TableSpec, subject: Subject, hand_name: str) -> Iterator[dict[str, Any]]:
     """Lift the best grasp of the first view."""
-    assert subject.folder is not None
-    hand, view = load_hand(hand_name), list_views(subject.folder, only=[subject.name])[0][1]
-    try:
-        grasps = plan_view(spec, subject, hand_name, view, "none")
-    except GraspError as error:
-        print(f"{subject.name}, {hand_name}: {error}", flush=True)
-        return
-    mesh, parts = read_solid(subject.folder, subject.name)
-    mass = household_mass(float(mesh.volume), read_entry(subject.folder, subject.name).mass)
-    for friction in FRICTIONS if len(grasps) else ():
+    hand, (mesh, parts, mass, view) = load_hand(hand_name), read_solid(subject)
+    grasps = plan_view(spec, subject, hand_name, HOUSEHOLD.trial.friction)
+    for friction in FRICTIONS if grasps else ():
         seed = seed_of(spec.seed, subject.label, view, str(friction))
         for name, force in HOLDINGS.items():
             changes = {"holding": name, "force": force, "mass": mass, "friction": friction, "hold_time": HOLD_TIME}
@@ -167,21 +148,20 @@ def least_grip_at(
 
 def _row(hand: str, name: str, lifts: Sequence[dict[str, Any]], base: Sequence[dict[str, Any]]) -> Row:
     """Return what one holding held of what can be held, and what force it spent."""
-    can = {(x["object"], x["friction"]) for x in lifts + list(base) if x["pressed"][0] is not None}
-    counts, first = (
-        count_by((x["family"], x["status"] == "OK") for x in some if (x["object"], x["friction"]) in can)
-        for some in (lifts, base)
+    can = {(x["object"], x["friction"]) for x in [*lifts, *base] if x["pressed"][0] is not None}
+    mine, first, rest = (
+        [x for x in some if ((x["object"], x["friction"]) in can) is holdable]
+        for some, holdable in ((lifts, True), (base, True), (lifts, False))
     )
-    share, change = share_over(counts), difference_over(counts, first)
-    held = [x for x in lifts if x["status"] == "OK"]
-    spent = statistics.median(x["end"][1] / x["end"][0] for x in held if x["end"][0])
-    lost = dict(Counter(x["status"] for x in lifts if x["status"] != "OK" and (x["object"], x["friction"]) in can))
-    rest = dict(Counter(x["status"] for x in lifts if (x["object"], x["friction"]) not in can))
-    words = (
-        f"{format_share(share)}, change {100 * change.value:+.1f} [{100 * change.low:+.1f}, {100 * change.high:+.1f}]"
-    )
-    words += f"; lost {lost}; of what cannot be held {rest}; force {spent:.2f}x of what suffices"
-    met = None if name == "force" else share.value >= LEAST_HELD and spent <= MOST_SPENT
-    numbers = {"share": share, "change": change, "spent": spent, "lost": lost, "rest": rest}
-    bar = f">= {LEAST_HELD:.0%} of what can be held, <= {MOST_SPENT}x"
-    return Row(f"held by holding {name}, {hand}", bar if name != "force" else "-", words, met, numbers)
+    held, before = (count_by((x["family"], x["status"] == "OK") for x in some) for some in (mine, first))
+    share, change = share_over(held), difference_over(held, before)
+    spent = [x["end"][1] / x["end"][0] for x in lifts if x["status"] == "OK" and x["end"][0]]
+    most = statistics.median(spent) if spent else math.nan
+    lost = dict(Counter(x["status"] for x in mine if x["status"] != "OK"))
+    others = dict(Counter(x["status"] for x in rest))
+    words = f"{format_share(share)}, change {format_points(change)}; lost {lost}"
+    words += f"; of what cannot be held {others}; force {most:.2f}x of what suffices"
+    bar, met = f">= {LEAST_HELD:.0%} of what can be held, <= {MOST_SPENT}x", share.value >= LEAST_HELD
+    bar, met = ("-", None) if name == "force" else (bar, met and most <= MOST_SPENT)
+    numbers = {"share": share, "change": change, "spent": most, "lost": lost, "rest": others}
+    return Row(f"held by holding {name}, {hand}", bar, words, met, numbers)

@@ -1,24 +1,24 @@
 """Trials that can tell closings apart: the object is elsewhere, turned, of another shape, mass or friction, afloat.
 
-Plans know nothing of it. Each law closes the same grasps with the same errors on the same draws. Plans and trials are
-kept as files: a campaign that was stopped goes on where it was.
+Plans know nothing of it. Each law closes the same grasps with the same errors on the same draws.
 """
 
 import dataclasses
 import functools
-import json
 import math
 import statistics
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
+import trimesh
+from paper.tables6_7 import format_points
+from paper.trials import Subject, TableSpec, subjects
+from sklearn.metrics import cohen_kappa_score, confusion_matrix
 
-from benchmarks.close.agreement import Verdicts, agreement_row
+from benchmarks.close.campaign import fit_view, keep, plan_view, read_solid, run_all, table_spec
 from benchmarks.close.conditions import (
     BARS,
     CONDITIONS,
@@ -33,28 +33,18 @@ from benchmarks.close.conditions import (
     draw_solid,
     swap_deviations,
 )
-from benchmarks.close.household import read_solid, table_spec
 from benchmarks.common import Options, Row, bench
-from benchmarks.perturb import PERTURBATIONS, household_mass, perturb_trial
-from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand, plan_grasps
+from benchmarks.perturb import PERTURBATIONS, perturb_trial
+from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand
 from torchgrasp.closure import SensorModel
-from torchgrasp.data import list_views, read_entry, read_view
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, pull_grasp
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import error_from_object_pose, seed_of
 from torchgrasp.evaluation.views import choose_rows
-from torchgrasp.files import write_file
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
-from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.jobs import run_tasks
-from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import load_grasps
 
 PLANNED_FRICTION = 0.6
 """Friction that grasps are planned for, and that the lifts have unless it is drawn: as in ada-grasp-ctrl (2025)."""
@@ -94,84 +84,91 @@ class Outcome:
 
 @bench("close/misplaced", objects=True)
 def misplaced(o: Options) -> list[Row]:
-    """Close on misplaced objects with every controller."""
-    return bench_misplaced(table_spec(o), o.conditions, o.laws)
+    """Close on misplaced objects with every controller, and compare each with `DEFAULT`, paired by grasp."""
+    return _bench(table_spec(o), o.conditions or tuple(CONDITIONS), o.laws or tuple(LAWS))
 
 
 @bench("close/sensors", objects=True)
 def sensors(o: Options) -> list[Row]:
     """Close on misplaced objects with poorer tactile sensors."""
-    return bench_misplaced(table_spec(o), o.conditions, o.laws or LAWS_OF_SENSORS)
+    return _bench(table_spec(o), o.conditions or tuple(CONDITIONS), o.laws or LAWS_OF_SENSORS)
 
 
-def bench_misplaced(spec: TableSpec, conditions: Sequence[str] = (), laws: Sequence[str] = ()) -> list[Row]:
-    """Close every law in every condition, or the named ones, and compare each with `DEFAULT`, paired by grasp."""
-    conditions, laws = conditions or tuple(CONDITIONS), laws or tuple(LAWS)
-    tasks = [
-        (spec, subject, hand, condition, tuple(laws))
-        for subject in subjects(spec)
-        for condition in conditions
-        for hand in spec.hands
-    ]
-    found: list[Outcome] = []
-    for task, outcome in zip(tasks, run_tasks(try_object, tasks, spec.workers, CELL_SECONDS), strict=True):
-        if isinstance(outcome, Status):
-            raise SystemExit(f"{task[1].name} {task[2]}: {outcome.sentence}")
-        found += [Outcome(**one) for one in outcome]
-    rows = [row for hand in spec.hands for c in conditions for row in _rows(hand, c, laws, found)]
+def _bench(spec: TableSpec, conditions: Sequence[str], laws: Sequence[str]) -> list[Row]:
+    """Close every law in every condition."""
+    tasks = [(spec, x, hand, name, laws) for x in subjects(spec) for name in conditions for hand in spec.hands]
+    found = [Outcome(**one) for outcomes in run_all(try_object, tasks, spec.workers) for one in outcomes]
+    rows = [row for hand in spec.hands for name in conditions for row in _rows(hand, name, laws, found)]
     return rows + _agreement_rows(found)
 
 
 def _agreement_rows(found: Sequence[Outcome]) -> list[Row]:
     """Return the agreement of the simulators where both ran the same trials: in each condition, and in all."""
     held = {(x.hand, x.object, x.rank, x.condition, x.law): x.held for x in found}
-    pairs: dict[str, list[Verdicts]] = {}
+    pairs: dict[str, list[tuple[str, bool, bool]]] = {}
     for x in found:
         other = held.get((x.hand, x.object, x.rank, f"{x.condition}{IN_MUJOCO}", x.law))
         if other is not None:
             pairs.setdefault(f"{x.hand}, {x.condition}", []).append((x.family, x.held, other))
     if len(pairs) > 1:
         pairs["all of these"] = [one for verdicts in pairs.values() for one in verdicts]
-    return [agreement_row(name, verdicts) for name, verdicts in pairs.items()]
+    return [_agreement_row(name, verdicts) for name, verdicts in pairs.items()]
+
+
+def _agreement_row(what: str, verdicts: list[tuple[str, bool, bool]]) -> Row:
+    """Return the share of equal verdicts of SAPIEN and MuJoCo by family, and which way the others went."""
+    _, *both = zip(*verdicts, strict=True)
+    table, kappa = confusion_matrix(*both, labels=[True, False]), float(cohen_kappa_score(*both, labels=[True, False]))
+    share = share_over(count_by((family, one == other) for family, one, other in verdicts))
+    measured = f"{format_share(share)}, kappa {kappa:.2f}; both hold {table[0, 0]}, both lose {table[1, 1]}, "
+    measured += f"SAPIEN alone holds {table[0, 1]}, MuJoCo alone {table[1, 0]}"
+    numbers = {"share": share, "table": table.tolist(), "kappa": kappa}
+    return Row(f"agreement of the simulators, {what}", ">= 93%", measured, share.value >= 0.93, numbers)
 
 
 def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcome]) -> Iterator[Row]:
     """Yield a row for each law in one condition."""
     there = [x for x in found if (x.hand, x.condition) == (hand, condition)]
-    base = [x for x in there if x.law == DEFAULT]
+    base, in_place = [x for x in there if x.law == DEFAULT], [x for x in found if x.condition == "in place"]
     for law in laws:
         mine = [x for x in there if x.law == law]
         if not mine:
             continue
-        held, against = share_over(_held(mine)), difference_over(_held(base), _held(mine))
+        held, first = (count_by((x.family, x.held) for x in some) for some in (mine, base))
+        share, better = share_over(held), difference_over(first, held)
         moved = median_over([(x.family, math.nan if x.moved is None else x.moved) for x in mine])
-        unbalanced = [x.unbalanced for x in mine if x.unbalanced is not None]
         lost = dict(Counter(x.status for x in mine if not x.held).most_common())
-        words = [format_share(held), "moved {:.1f} mm [{:.1f}, {:.1f}]".format(*moved)]
-        words += [f"unbalanced {statistics.median(unbalanced):.2f}"] if unbalanced else []
-        most = [x.most for x in mine if x.most is not None]
-        words += [f"largest force {statistics.median(most):.1f} N, {max(most):.1f} N in the worst"] if most else []
+        words = [format_share(share), "moved {:.1f} mm [{:.1f}, {:.1f}]".format(*moved), *_forces(mine)]
         if law != DEFAULT and base:
-            low, high = 100 * against.low, 100 * against.high
-            words.append(f"{DEFAULT} is better by {100 * against.value:+.1f} points [{low:.1f}, {high:.1f}]")
-            words.append("it moves things by {:+.2f} mm [{:.2f}, {:.2f}] less".format(*_moved_less(base, mine)))
-        words += [f"lost {lost}", *_when_lost(mine, [x for x in found if (x.hand, x.condition) == (hand, "in place")])]
-        least, most = BARS.get(condition, (0.0, math.inf)) if law == DEFAULT else (0.0, math.inf)
-        bar = f">= {least:.0%}, <= {most:g} mm" if least else "-"
-        met = held.value >= least and moved[0] <= most if least else None
-        numbers = {"held": held, "better": against, "moved_mm": moved, "lost": lost}
+            less = "it moves things by {:+.2f} mm [{:.2f}, {:.2f}] less".format(*_moved_less(base, mine))
+            words += [f"{DEFAULT} is better by {format_points(better)}", less]
+        words += [f"lost {lost}", *_when_lost(mine, in_place)]
+        numbers = {"held": share, "better": better, "moved_mm": moved, "lost": lost}
+        bar, met = "-", None
+        if law == DEFAULT and condition in BARS:
+            least, most = BARS[condition]
+            bar, met = f">= {least:.0%}, <= {most:g} mm", share.value >= least and moved[0] <= most
         yield Row(f"{hand}, {condition}, {law}", bar, "; ".join(words), met, numbers)
+
+
+def _forces(mine: Sequence[Outcome]) -> list[str]:
+    """Say how far the forces were from balance before the lift, and how large they were."""
+    unbalanced = [x.unbalanced for x in mine if x.unbalanced is not None]
+    most = [x.most for x in mine if x.most is not None]
+    words = [f"unbalanced {statistics.median(unbalanced):.2f}"] if unbalanced else []
+    return words + ([f"largest force {statistics.median(most):.1f} N, {max(most):.1f} N in the worst"] if most else [])
 
 
 def _when_lost(mine: Sequence[Outcome], in_place: Sequence[Outcome]) -> list[str]:
     """Say how many were hit in the approach, and how many of the lost are lost in place, too, where that was tried."""
-    lost, seen = [x for x in mine if not x.held], [x for x in mine if x.early is not None]
-    hit = [x for x in seen if x.early is not None and x.early > HIT]
-    told = f"{len(hit)} were moved by over {HIT:g} mm in the approach, {sum(not x.held for x in hit)} of them lost"
-    words = [told] if seen else []
+    lost, early = [x for x in mine if not x.held], [(x.early, x.held) for x in mine if x.early is not None]
+    hit = [held for moved, held in early if moved > HIT]
+    told = f"{len(hit)} were moved by over {HIT:g} mm in the approach, {len(hit) - sum(hit)} of them lost"
+    words = [told] if early else []
     if in_place and lost and lost[0].condition != "in place":
-        anyway = {(x.object, x.rank, x.law) for x in in_place if not x.held}
-        words.append(f"{sum((x.object, x.rank, x.law) in anyway for x in lost)} are lost in place, too")
+        anyway = {(x.hand, x.object, x.rank, x.law) for x in in_place if not x.held}
+        count = sum((x.hand, x.object, x.rank, x.law) in anyway for x in lost)
+        words.append(f"{count} are lost in place, too")
     return words
 
 
@@ -194,57 +191,42 @@ def median_over(values: Sequence[tuple[str, float]], seed: int = 0) -> tuple[flo
     return float(medians.quantile(0.5)), low, high
 
 
-def _held(outcomes: Iterable[Outcome]) -> dict[str, tuple[int, int]]:
-    """Return the counts of what held by family."""
-    return count_by((x.family, x.held) for x in outcomes)
-
-
 def try_object(
-    spec: TableSpec, subject: Subject, hand: str, condition: str, laws: tuple[str, ...]
+    spec: TableSpec, subject: Subject, hand: str, condition: str, laws: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return the outcomes of one object in one condition, as they are kept, a line each; what is missing is run."""
-    torch.set_num_threads(1)
-    path = spec.kept("misplaced", f"{hand}_{subject.label}_{condition}", spec.grasps).with_suffix(".jsonl")
-    kept = [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.is_file() else []
-    missing = [law for law in laws if law not in {one["law"] for one in kept}]
-    if missing:
-        kept += [dataclasses.asdict(x) for x in _try(spec, subject, hand, condition, missing)]
-        write_file(path, "".join(f"{json.dumps(one)}\n" for one in kept))
-    return [one for one in kept if one["law"] in laws]
+    """Return the outcomes of one object in one condition, kept or run."""
+    found: list[dict[str, Any]] = []
+    for law in laws:
+        path = spec.kept("misplaced", f"{hand}_{subject.label}_{condition}_{law}", spec.grasps).with_suffix(".json")
+        found += keep(path, lambda: list(map(dataclasses.asdict, _try(spec, subject, hand, condition, law))))  # noqa: B023
+    return found
 
 
-def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, laws: list[str]) -> Iterator[Outcome]:
+def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, law: str) -> Iterator[Outcome]:
     """Put grasps of one view, spread over the ranks, to one condition."""
-    folder, wrong = subject.folder, CONDITIONS[condition]
-    assert folder is not None
-    view = list_views(folder, only=[subject.name])[0][1]
-    known = subject.label, subject.family, hand
-    try:
-        grasps = _plan(spec, subject, hand, view)
-    except GraspError as error:
-        print(f"{subject.name}, {hand}: {error}", flush=True)
-        return
-    mesh, parts = read_solid(folder, subject.name)
-    mass = household_mass(float(mesh.volume), read_entry(folder, subject.name).mass)
-    shape, surface = _fit(folder, subject.name, view)
+    wrong, followed, view = CONDITIONS[condition], (LAWS | SENSED | FRAGILE)[law], read_solid(subject).view
+    grasps = plan_view(spec, subject, hand, PLANNED_FRICTION)
     for rank in choose_rows(len(grasps), spec.grasps, "spread"):
-        seed = seed_of(spec.seed, subject.label, view, rank, 0)
-        if wrong.drawn:
-            try:
-                mesh = draw_solid(shape, seed)
-                parts = convex_parts(mesh)
-            except GraspError as problem:
-                print(f"{subject.name}, {hand}: {problem}", flush=True)
-                continue
-        error = _misplace(wrong, grasps[rank], mesh, seed)
-        for law in laws:
-            began = time.process_time()
-            followed = (LAWS | SENSED | FRAGILE)[law]
-            grasp = swap_deviations(grasps[rank]) if followed.swapped else grasps[rank]
-            touch = seed_of(seed, "touch")
-            trial = GraspTrial(load_hand(hand), grasp, mesh, touch, error, parts=parts, surface=surface)
-            measured = _run(trial, wrong, followed, mass, seed)
-            yield Outcome(*known, rank, condition, law, seconds=time.process_time() - began, **measured)
+        began, seed = time.process_time(), seed_of(spec.seed, subject.label, view, rank, 0)
+        try:
+            mesh, parts = _drawn_solid(spec, subject, seed) if wrong.drawn else read_solid(subject)[:2]
+        except GraspError as problem:
+            print(f"{subject.name}, {hand}: {problem}", flush=True)
+            continue
+        error, touch = _misplace(wrong, grasps[rank], mesh, seed), seed_of(seed, "touch")
+        grasp = swap_deviations(grasps[rank]) if followed.swapped else grasps[rank]
+        surface = fit_view(spec, subject)[1]
+        trial = GraspTrial(load_hand(hand), grasp, mesh, touch, error, parts=parts, surface=surface)
+        measured = _run(trial, wrong, followed, read_solid(subject).mass, seed)
+        known = subject.label, subject.family, hand, rank, condition, law
+        yield Outcome(*known, seconds=time.process_time() - began, **measured)
+
+
+@functools.lru_cache(maxsize=8)
+def _drawn_solid(spec: TableSpec, subject: Subject, seed: int) -> tuple[trimesh.Trimesh, Sequence[trimesh.Trimesh]]:
+    """Return a solid of the posterior with its convex parts."""
+    mesh = draw_solid(fit_view(spec, subject)[0], seed)
+    return mesh, convex_parts(mesh)
 
 
 def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) -> dict[str, Any]:
@@ -291,22 +273,3 @@ def _misplace(wrong: Condition, grasp: Grasps, mesh: Any, seed: int) -> torch.Te
 def _centre(mesh: Any) -> torch.Tensor:
     """Return the mass centre [m]."""
     return torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
-
-
-def _plan(spec: TableSpec, subject: Subject, hand: str, view: str) -> Grasps:
-    """Return the executable grasps of a view, kept or planned."""
-    assert subject.folder is not None
-    path = spec.kept("misplaced", f"{hand}_{subject.label}_{view}", "plan").with_suffix(".safetensors")
-    if not path.is_file():
-        cloud = read_view(subject.folder, subject.name, view)
-        contacts = ContactSpec(friction=PLANNED_FRICTION, table=0.0)
-        grasps = plan_grasps(cloud, load_hand(hand), contacts, spec.starts, spec.seed)
-        grasps[grasps.status == Status.OK].save(path)
-    return load_grasps(path)
-
-
-@functools.lru_cache(maxsize=2)
-def _fit(folder: Path, name: str, view: str) -> tuple[ShapeGP, SignedDistanceField]:
-    """Return the shape of a view, and its surface as touches are compared with it."""
-    shape = fit_shape(read_view(folder, name, view), table=0.0)
-    return shape, surface_field(shape)

@@ -13,7 +13,6 @@ from benchmarks.common import Options, Row, bench, least_seconds
 from benchmarks.ground_truth import read_views
 from benchmarks.shape.accuracy import Row as View
 from benchmarks.shape.accuracy import format_groups, format_table, mean_row, measure_shape
-from benchmarks.shape.closure_survival import closure_survival
 from benchmarks.shape.walls import measure_walls
 from torchgrasp.data import read_entry
 from torchgrasp.evaluation.intervals import mean_over
@@ -40,7 +39,6 @@ def objects(o: Options) -> list[Row]:
             middle <= 0.25,
             {"seconds": seconds},
         ),
-        _mean_closure(ours, paper),
         Row(
             "coverage of the hidden true surface by 1 and 2 std_m",
             "68 +- 7 %, 95 +- 4 %; no view under 80 % at 2",
@@ -61,14 +59,14 @@ def objects(o: Options) -> list[Row]:
 
 
 def _measure(objects: Path, only: Sequence[str], support: Literal["camera", "paper"]) -> list[View]:
-    """Return errors, coverage and survival of closure of every view, with its object's family and group."""
+    """Return errors, and coverage of every view, with its object's family and group."""
     views = []
     for name, view, cloud, mesh in tqdm(list(read_views(objects, views=only)), desc=support, disable=None, leave=False):
         found = fit_shape(cloud, support=support, table=0.0)
         entry = read_entry(objects, name)
         told = {"object": name, "view": view, "family": entry.family, "group": entry.group}
         walls = measure_walls(found, mesh, cloud) if told["group"] == "shell" and support == "camera" else {}
-        views.append(told | measure_shape(found, mesh, cloud) | closure_survival(found, mesh) | walls)
+        views.append(told | measure_shape(found, mesh, cloud) | walls)
     return views
 
 
@@ -112,18 +110,5 @@ def _mean_errors(ours: View, paper: View, views: int) -> Row:
         "<= 2.6 / 13.3 mm, <= 15 degrees",
         f"{text[0]} (paper's points {text[1]})",
         all(ours[key] <= bar for key, bar in zip(keys, (2.6, 13.3, 15.0), strict=True)),
-        {"camera": {key: ours[key] for key in keys}, "paper": {key: paper[key] for key in keys}},
-    )
-
-
-def _mean_closure(ours: View, paper: View) -> Row:
-    """Return the row of the contact triples that stay closed, mean over views, with the paper's points beside it."""
-    keys = ("sure_0.6", "sure_0.8", "flat_0.6", "flat_0.8")
-    text = ["{:.2f} / {:.2f} and {:.2f} / {:.2f}".format(*(r[key] for key in keys)) for r in (ours, paper)]
-    return Row(
-        "triples closed on the GP that are closed on the true surface at friction .6 / .8, and flat ones planned at .4",
-        ">= .64 / .78 and >= .84 / .91",
-        f"{text[0]} (paper's points {text[1]})",
-        all(ours[key] >= bar for key, bar in zip(keys, (0.64, 0.78, 0.84, 0.91), strict=True)),
         {"camera": {key: ours[key] for key in keys}, "paper": {key: paper[key] for key in keys}},
     )

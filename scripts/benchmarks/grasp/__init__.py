@@ -1,1 +1,0 @@
-"""The whole chain, from one view to a held object."""
