@@ -27,6 +27,7 @@ from torchgrasp.plan.closure import solve_closure_lp, wrenches
 SIMULATED = "close/perturb"
 RUNS = ("gpu/kernels", "hand/collision", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
 
+
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", [*RUNS, pytest.param(SIMULATED, marks=pytest.mark.sim)])
 def test_bench_writes_its_rows(name, tin, tmp_path, capsys):
