@@ -111,7 +111,9 @@ class _Store:
         self.rows: dict[int, JobRow] = {}
         self.digests: dict[int, str] = {}
         for k in self.shards:
-            self._look(k)
+            rows = {j: shard.rows[0]._replace(meta={}) for j, shard in self._find(k).items()}
+            self.rows |= {j: row for j, row in rows.items() if row.status not in FAILED}
+            self._close(k)
 
     def missing(self) -> list[int]:
         """Return the indices of the jobs that still have to run."""
@@ -119,64 +121,40 @@ class _Store:
 
     def put(self, j: int, data: bytes) -> JobRow:
         """Write the file of a finished job; return its row."""
-        row = self._row_of(j, load_shard(write_file(self._part(j), data), self.campaign.meta))
-        self.rows[j] = row._replace(meta={})
+        (shard,) = self._load(write_file(self._part(j), data), [j])
+        self.rows[j] = shard.rows[0]._replace(meta={})
         self._close(j // self.size)
         return self.rows[j]
 
     def finish(self) -> None:
         """Write both cards, the JSON card last, and remove the folder of single jobs."""
-        rows = tuple(self.rows[j] for j in range(len(self.campaign.rows)))
-        digests = [self.digests[k] for k in self.shards]
-        card = card_of(self.campaign.asked, self.campaign.meta["campaign"], rows, digests)
+        rows = [self.rows[j] for j in range(len(self.campaign.rows))]
+        card = card_of(self.campaign, rows, [self.digests[k] for k in self.shards])
         write_file(self.folder / README, describe(card))
         write_file(self.folder / CARD, format_json(card) + "\n")
         with contextlib.suppress(OSError):  # it may hold what is not ours
             (self.folder / PARTS).rmdir()
 
-    def _look(self, k: int) -> None:
-        """Find the undamaged jobs of shard k: in the shard's file, or each in its own file."""
-        settled = {j: row for j, row in self._saved(k).items() if row.status not in FAILED}
-        self.rows |= settled
-        if len(settled) == len(self._jobs(k)):
-            self._settle(k)
-            return
-        for j in self._jobs(k):
-            if j not in settled:
-                with contextlib.suppress(ModelFileError):
-                    row = self._row_of(j, load_shard(self._part(j), self.campaign.meta))
-                    if row.status not in FAILED:
-                        self.rows[j] = row._replace(meta={})
-        self._close(k)
-
-    def _saved(self, k: int) -> dict[int, JobRow]:
-        """Return the rows in the file of shard k; none if the file is missing or damaged."""
-        try:
-            shard = load_shard(shard_path(self.folder, k), self.campaign.meta)
-            jobs = self._jobs(k)
-            if len(shard.rows) != len(jobs):
-                return {}
-            return {j: self._row_of(j, shard.take(i))._replace(meta={}) for i, j in enumerate(jobs)}
-        except ModelFileError:
-            return {}
+    def _find(self, k: int) -> dict[int, Shard]:
+        """Return the undamaged jobs of shard k: each from its own file, or from the shard's file."""
+        jobs, found = self._jobs(k), dict[int, Shard]()
+        with contextlib.suppress(ModelFileError):
+            found = dict(zip(jobs, self._load(shard_path(self.folder, k), jobs), strict=True))
+        for j in jobs:
+            with contextlib.suppress(ModelFileError):
+                (found[j],) = self._load(self._part(j), [j])
+        return found
 
     def _close(self, k: int) -> None:
-        """Write shard k if all of its jobs have finished."""
-        if any(j not in self.rows for j in self._jobs(k)):
+        """Write shard k if all of its jobs have finished, and remove their own files."""
+        path, jobs = shard_path(self.folder, k), self._jobs(k)
+        if any(j not in self.rows for j in jobs):
             return
-        path, parts = shard_path(self.folder, k), []
-        for i, j in enumerate(self._jobs(k)):
-            try:
-                parts.append(load_shard(self._part(j), self.campaign.meta))
-            except ModelFileError:
-                parts.append(load_shard(path, self.campaign.meta).take(i))
-        write_file(path, pack_shard(join_shards(parts), self.campaign.meta))
-        self._settle(k)
-
-    def _settle(self, k: int) -> None:
-        """Store the hash of the complete shard k, and remove the files of its jobs."""
-        self.digests[k] = sha256(shard_path(self.folder, k))
-        for j in self._jobs(k):
+        if any(self._part(j).is_file() for j in jobs):
+            found = self._find(k)
+            write_file(path, pack_shard(join_shards([found[j] for j in jobs]), self.campaign.meta))
+        self.digests[k] = sha256(path)
+        for j in jobs:
             remove_file(self._part(j))
 
     def _jobs(self, k: int) -> range:
@@ -187,24 +165,18 @@ class _Store:
         """Return the path of the file of job j, used until its shard is complete."""
         return self.folder / PARTS / f"job-{j:06d}.safetensors"
 
-    def _row_of(self, j: int, shard: Shard) -> JobRow:
-        """Return the row of a shard with one job; raise `ModelFileError` if it is not job j."""
-        row, asked = shard.rows[0], self.campaign.rows[j]
-        if len(shard.rows) != 1 or (row.object, row.view) != (asked.object, asked.view):
-            raise ModelFileError("path", f"{(row.object, row.view)}", f"{(asked.object, asked.view)}")
-        return row
+    def _load(self, path: Path, jobs: Sequence[int]) -> list[Shard]:
+        """Read the jobs of a file one by one; raise `ModelFileError` unless they are the given jobs."""
+        shard = load_shard(path, self.campaign.meta)
+        held = [(row.object, row.view) for row in shard.rows]
+        if held != (asked := [(self.campaign.rows[j].object, self.campaign.rows[j].view) for j in jobs]):
+            raise ModelFileError("path", f"{path} of {held}", f"{asked}")
+        return [shard.take(i) for i in range(len(jobs))]
 
 
-def card_of(asked: dict[str, Any], campaign: str, rows: Sequence[JobRow], digests: Sequence[str]) -> dict[str, Any]:
-    """Return the content of `card.json`, which describes a data set.
-
-    Args:
-        asked: content of `campaign.json`.
-        campaign: SHA-256 of `campaign.json`, which each shard names.
-        rows: rows of all jobs.
-        digests: SHA-256 of each shard.
-    """
-    tries = asked["protocol"]["noise"]["draws"]
+def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> dict[str, Any]:
+    """Return the content of `card.json`, given the rows of all jobs and the SHA-256 of each shard."""
+    asked, tries = campaign.asked, campaign.asked["protocol"]["noise"]["draws"]
     counts = {
         "jobs": len(rows),
         "status": dict(Counter(row.status.name for row in rows).most_common()),
@@ -221,11 +193,11 @@ def card_of(asked: dict[str, Any], campaign: str, rows: Sequence[JobRow], digest
         "torchgrasp": "grasp-shards",
         "version": 1,
         "licence": asked["licence"],
-        "campaign": campaign,
+        "campaign": campaign.meta["campaign"],
         "jobs_in_shard": asked["jobs_in_shard"],
         "asked": asked,
         "counts": counts,
-        "shards_sha256": list(digests),
+        "shards_sha256": digests,
         "jobs": jobs,
     }
 

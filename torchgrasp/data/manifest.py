@@ -86,14 +86,10 @@ def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, Obj
 def _parse_entry(name: str, field: Field) -> ObjectEntry:
     """Check an object's entry in the manifest, and return it."""
     _check_name(field, name)
-    fields, views = field.entries(), {}
-    if "views" not in fields:
-        raise field.wrong('an object with "views"')
+    fields, views = field.entries("views"), {}
     for view, of_view in fields["views"].entries().items():
         _check_name(of_view, view)
-        pose = of_view.entries().get("T_object_camera")
-        if pose is None:
-            raise of_view.wrong('an object with "T_object_camera"')
+        pose = of_view.entries("T_object_camera")["T_object_camera"]
         rows = [row.numbers(4, -MOST_METRES, MOST_METRES) for row in pose.items(4)]
         if len(rows) != 4:
             raise pose.wrong("4 rows of 4 numbers")

@@ -165,9 +165,7 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
         return ModelFileError("folder", found, allowed)
 
     card = read_json(folder / CARD, refuse, "a folder that `torchgrasp campaign` finished", most_card)
-    fields = card.entries()
-    if missing := {"campaign", "jobs_in_shard", "jobs"} - set(fields):
-        raise card.wrong(f"a file with {min(missing)!r}")
+    fields = card.entries("campaign", "jobs_in_shard", "jobs")
     fields["campaign"].text()
     jobs = tuple(read_row(row, bare=True) for row in fields["jobs"].items(MOST))
     size = fields["jobs_in_shard"].whole(1, MOST)

@@ -124,9 +124,7 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
     Raises:
         ModelFileError: a missing field, or a field of a wrong type or range.
     """
-    fields = field.entries()
-    if missing := set(JobRow._fields) - ({"meta"} if bare else set()) - set(fields):
-        raise field.wrong(f"an object with {min(missing)!r}")
+    fields = field.entries(*JobRow._fields[: -1 if bare else None])  # the metadata comes last
     texts = {name: fields[name].text() for name in ("object", "view", "note", "family", "group")}
     counts = {name: fields[name].whole(0, MOST) for name in ("executable", "points", "grasps", "passed")}
     status = fields["status"].text()

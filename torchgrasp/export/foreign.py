@@ -7,8 +7,6 @@ trust:
     numpy.savez("0.npz", grasp_qpos=content["grasp_qpos"], pregrasp_qpos=content["pregrasp_qpos"])
 """
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -22,9 +20,9 @@ from torchgrasp.checks import Length, Poses, checked
 from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.control.law import damped_inverse
 from torchgrasp.errors import BadArgument, ModelFileError, Status
-from torchgrasp.export.other_formats import BENCH_HANDS, rotation_of
+from torchgrasp.export.other_formats import bench_frame
 from torchgrasp.files import Field, is_file, read_bytes, read_json
-from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.frames import apply, rigid, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.limits import CLOUD_BYTES
 from torchgrasp.plan.certify import certify
@@ -85,14 +83,11 @@ def read_foreign(
     path = Path(path)
     if path.suffix.lower() == ".npz":
         return _read_bench(path, hand, tuple(order), quaternion)
-    content = read_json(path, _refuse, "a JSON file of grasps, or .npz").entries()
-    if "grasps" in content:
-        return _read_own(content["grasps"], hand)
-    if not {"pose", "dofs"} <= content.keys():
-        raise _refuse(f"{path}: fields {', '.join(content)[:80]}", "'grasps', or 'pose' and 'dofs'")
-    places = _places(hand, tuple(order))
-    pose = _table(content["pose"], 7)
-    dofs = _table(content["dofs"], len(order))
+    file = read_json(path, _refuse, "a JSON file of grasps, or .npz")
+    if "grasps" in file.entries():
+        return _read_own(file.entries()["grasps"], hand)
+    content, places = file.entries("pose", "dofs"), _places(hand, tuple(order))
+    pose, dofs = _table(content["pose"], 7), _table(content["dofs"], len(order))
     if len(pose) != len(dofs):
         raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
     return ForeignGrasps(torch.tensor(dofs[:, places]), _poses(pose, quaternion), None)
@@ -107,26 +102,15 @@ def _read_own(rows: Field, hand: Hand) -> ForeignGrasps:
     """Read grasps in the JSON format of `format_grasps`."""
     joints, opened, poses = list[list[float]](), list[list[float]](), list[list[float]]()
     for row in rows.items(MOST_GRASPS):
-        fields = row.entries()
-        for named, values in (("grasp", joints), ("pregrasp", opened)):
-            posture = _entry(_entry(fields, "joints", row).entries(), named, row).entries()
-            values.append([_entry(posture, name, row).number(-FAR, FAR) for name in hand.joint_names])
-        pose = _entry(fields, "pose", row).entries()
-        position, quaternion = _entry(pose, "position", row), _entry(pose, "quaternion_wxyz", row)
-        poses.append([*position.numbers(3, -FAR, FAR), *quaternion.numbers(4, -FAR, FAR)])
-    h = len(hand.joint_names)
-    return ForeignGrasps(
-        torch.tensor(joints, dtype=torch.float64).reshape(-1, h),
-        _poses(np.array(poses, dtype=float).reshape(-1, 7), "wxyz"),
-        torch.tensor(opened, dtype=torch.float64).reshape(-1, h),
-    )
-
-
-def _entry(fields: dict[str, Field], name: str, row: Field) -> Field:
-    """Return a required field of a row; raise `ModelFileError` if it is missing."""
-    if name not in fields:
-        raise _refuse(f"{row.path}: {row.place} without {name!r}", f"a field {name!r}")
-    return fields[name]
+        fields = row.entries("joints", "pose")
+        postures, pose = fields["joints"].entries("grasp", "pregrasp"), fields["pose"]
+        for name, values in (("grasp", joints), ("pregrasp", opened)):
+            posture = postures[name].entries(*hand.joint_names)
+            values.append([posture[joint].number(-FAR, FAR) for joint in hand.joint_names])
+        place = pose.entries("position", "quaternion_wxyz")
+        poses.append([*place["position"].numbers(3, -FAR, FAR), *place["quaternion_wxyz"].numbers(4, -FAR, FAR)])
+    closed, pregrasp = (torch.tensor(x, dtype=torch.float64).reshape(-1, hand.dof) for x in (joints, opened))
+    return ForeignGrasps(closed, _poses(np.array(poses, dtype=float).reshape(-1, 7), "wxyz"), pregrasp)
 
 
 def _table(field: Field, width: int) -> np.ndarray:
@@ -136,18 +120,15 @@ def _table(field: Field, width: int) -> np.ndarray:
 
 def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion) -> ForeignGrasps:
     """Read an .npz in DexGraspBench's format, with one grasp or rows of grasps."""
-    turn, known = BENCH_HANDS.get(hand.name, ([1.0, 0.0, 0.0, 0.0], ()))
-    order = order or tuple(known)
+    bench_from_root, known = bench_frame(hand)
+    order = order or known
     places, width = _places(hand, order), 7 + len(order)
-    if not is_file(path):
-        raise _refuse(f"{path}, which is no file", "an .npz with 'grasp_qpos'")
-    allowed = "an .npz of at most 512 MiB with 'grasp_qpos'"
     try:
-        if path.stat().st_size > CLOUD_BYTES:
-            raise ValueError("a larger file")
+        if not is_file(path) or path.stat().st_size > CLOUD_BYTES:
+            raise ValueError("no file, or a larger one")
         tables = parse_npz(read_bytes(path), ("grasp_qpos", "pregrasp_qpos"), "grasp_qpos")
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
-        raise _refuse(f"{path}: {error}", allowed) from error
+    except Exception as error:  # zlib, zipfile and NumPy each raise their own
+        raise _refuse(f"{path}: {error}", "an .npz of at most 512 MiB with 'grasp_qpos'") from error
     for name, table in tables.items():
         good = table.dtype.kind == "f" and table.ndim in (1, 2) and table.shape[-1] == width
         if not good or table.size > MOST_GRASPS * width or not np.isfinite(table).all():
@@ -156,12 +137,10 @@ def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quat
     rows = {name: table.reshape(-1, width).astype(float) for name, table in tables.items()}
     if len({len(table) for table in rows.values()}) != 1:
         raise _refuse(f"{path}: {', '.join(f'{len(x)} of {name}' for name, x in rows.items())}", "as many of either")
-    moved_from_root = torch.eye(4, dtype=torch.float64)
-    moved_from_root[:3, :3] = rotation_of(turn)
     grasp, opened = rows["grasp_qpos"], rows.get("pregrasp_qpos")
     return ForeignGrasps(
         torch.tensor(grasp[:, 7:][:, places]),
-        _poses(grasp[:, :7], quaternion) @ moved_from_root,
+        _poses(grasp[:, :7], quaternion) @ bench_from_root,
         None if opened is None else torch.tensor(opened[:, 7:][:, places]),
     )
 
@@ -177,18 +156,15 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
 
 def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
     """Return pose matrices from positions and quaternions (g, 7)."""
-    tolerance = 1e-3  # largest difference from 1 of a quaternion's length in a file of few digits
     from scipy.spatial.transform import Rotation
 
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
-    far = np.abs(np.linalg.norm(turns, axis=1) - 1) > tolerance
+    far = np.abs(np.linalg.norm(turns, axis=1) - 1) > 1e-3  # more than the rounding of a file of few digits
     if far.any():
         length = float(np.linalg.norm(turns[far][0]))
         raise _refuse(f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}", "length 1")
     matrices = Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
-    pose = torch.eye(4, dtype=torch.float64).repeat(len(numbers), 1, 1)
-    pose[:, :3, :3], pose[:, :3, 3] = torch.tensor(matrices), torch.tensor(numbers[:, :3])
-    return pose
+    return rigid(torch.tensor(matrices), torch.tensor(numbers[:, :3]))
 
 
 @checked
@@ -230,9 +206,9 @@ def grasps_from_joints(
     normals = -rotate(pose, pad_normals)
     std = None if std_m is None else torch.full_like(normals[..., 0], std_m)
     contacts = Contacts(apply(pose, pads), normals, std_m=std)
-    certificate = certify(contacts, ContactSpec() if spec is None else spec)
+    certificate = certify(contacts, spec)
     opened = _open(hand, joints, -pad_normals) if pregrasp is None else hand.check_joints(pregrasp.double().cpu())
-    g, f = len(joints), len(hand.tips)
+    g, f = normals.shape[:2]
     return Grasps(
         joints=joints,
         pregrasp=opened,
@@ -258,8 +234,7 @@ def grasps_from_joints(
 
 def _open(hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]) -> Float[Tensor, "g h"]:
     """Return joints at which the fingertips are moved off their contacts along the normals, within the limits."""
-    # How far [m] fingertips stand off where no pre-grasp is given, and in how many linear steps: within 1 mm
-    opening, steps = 0.02, 4
+    opening, steps = 0.02, 4  # distance [m], and linear steps, which reach it within 1 mm
     for _ in range(steps):
         jacobian = hand.jacobian(joints).flatten(1, 2)
         step = damped_inverse(jacobian) @ (opening / steps * away).flatten(1)[..., None]

@@ -12,19 +12,20 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchgrasp.checks import Positive, Range, checked
-from torchgrasp.control.forces import squeeze
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.export.postures import quaternion
+from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import format_json, write_file
+from torchgrasp.geometry.frames import rigid
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values import Grasps
 
-BENCH_HANDS = {"allegro": ([0.0, 1.0, 0.0, 1.0], [f"joint_{k}" for k in range(16)])}
-"""Of each hand that the bench has, too: the rotation (w, x, y, z) of our root link in the frame that it moves, and our
-joints in the order of its model: first, middle, ring finger, thumb."""
+BENCH_HANDS = {"allegro": ([1.0, 0.0, 1.0, 0.0], tuple(f"joint_{k}" for k in range(16)))}
+"""Hands of the bench: rotation (x, y, z, w) of our root link in the frame that it moves, our joints in its order."""
 
 
 @checked
@@ -61,28 +62,19 @@ def save_dexgraspbench(
     >>> [file.name for file in save_dexgraspbench(hand, grasp, tempfile.mkdtemp(), "assets/object/jug")]
     ['0.npy']
     """
-    if hand.name not in BENCH_HANDS:
-        raise BadArgument(
-            "hand", repr(hand.name), f"one of {', '.join(BENCH_HANDS)}, whose frames in the bench are known"
-        )
-    hand, grasps = hand.to("cpu"), grasps.to("cpu")
-    turn, order = BENCH_HANDS[hand.name]
-    postures = {
-        "pregrasp_qpos": grasps.pregrasp.double(),
-        "grasp_qpos": grasps.joints.double(),
-        "squeeze_qpos": squeeze(hand, grasps, force, kp).joints,
-    }
-    named = {key: hand.expand(joints) for key, joints in postures.items()}
-    moved_from_root = torch.eye(4, dtype=torch.float64)
-    moved_from_root[:3, :3] = rotation_of(turn)
+    bench_from_root, order = bench_frame(hand)
+    if not order:
+        known = f"one of {', '.join(BENCH_HANDS)}, whose frames in the bench are known"
+        raise BadArgument("hand", repr(hand.name), known)
+    _, postures = named_postures(hand, grasps, force, kp)
     paths = list[Path]()
-    for row, pose in enumerate(grasps.obj_from_hand.double().cpu()):
-        moved = pose @ moved_from_root.mT  # object from what the bench moves
-        place = [*moved[:3, 3].tolist(), *quaternion(moved)]
+    for row, obj_from_root in enumerate(grasps.obj_from_hand.double().cpu()):
+        obj_from_bench = obj_from_root @ bench_from_root.mT
+        place = [*obj_from_bench[:3, 3].tolist(), *quaternion(obj_from_bench)]
         content: dict[str, Any] = {"obj_path": object_path, "obj_scale": 1.0}
         content["obj_pose"] = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-        for key, joints in named.items():
-            content[key] = np.array([*place, *(float(joints[name][row]) for name in order)])
+        for name, joints in postures.items():
+            content[f"{name}_qpos"] = np.array([*place, *(float(joints[joint][row]) for joint in order)])
         paths.append(write_file(Path(folder) / f"{row}.npy", lambda file, x=content: np.save(file, np.array(x))))
     return paths
 
@@ -110,12 +102,12 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
     return format_json({"object": {"file": object_path, "scale": 1.0}, "joint_names": joint_names, "grasps": rows})
 
 
-def rotation_of(wxyz: list[float]) -> torch.Tensor:
-    """Return the rotation matrix of a quaternion (w, x, y, z) of any length."""
+def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
+    """Return `bench_from_root` and the order of joints of DexGraspBench; identity and () for a hand that it lacks."""
     from scipy.spatial.transform import Rotation
 
-    w, x, y, z = wxyz
-    return torch.tensor(Rotation.from_quat([x, y, z, w]).as_matrix())
+    turn, order = BENCH_HANDS.get(hand.name, ([0.0, 0.0, 0.0, 1.0], ()))
+    return rigid(torch.tensor(Rotation.from_quat(turn).as_matrix()), torch.zeros(3, dtype=torch.float64)), order
 
 
 @checked

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Positive, Range, checked
-from torchgrasp.control.forces import squeeze
+from torchgrasp.control.forces import Squeeze, squeeze
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.errors import Status
 from torchgrasp.files import format_json
@@ -54,12 +54,9 @@ def format_grasps(
     >>> sorted(json.loads(text)["grasps"][0]["joints"])
     ['grasp', 'pregrasp', 'squeeze']
     """
-    hand, grasps = hand.to("cpu"), grasps.to("cpu")
-    squeezed, path = squeeze(hand, grasps, force, kp), hand.urdf_path
-    forces = rotate(grasps.obj_from_hand.double(), squeezed.forces)
-    postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}
-    named = {name: hand.expand(joints) for name, joints in postures.items()}
-    std = grasps.contacts.std_m
+    grasps, path = grasps.to("cpu"), hand.urdf_path
+    squeezed, postures = named_postures(hand, grasps, force, kp)
+    forces, std = rotate(grasps.obj_from_hand.double(), squeezed.forces), grasps.contacts.std_m
     rows = [
         {
             "rank": row,
@@ -67,7 +64,7 @@ def format_grasps(
             "success": float(grasps.success[row]),
             "pose": {"position": pose[:3, 3].tolist(), "quaternion_wxyz": quaternion(pose)},
             "approach": {"direction": grasps.approach[row].tolist(), "distance": APPROACH_DISTANCE},
-            "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in named.items()},
+            "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in postures.items()},
             "torque": dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True)),
             "contacts": [
                 {
@@ -101,6 +98,16 @@ def format_grasps(
     return format_json(content)
 
 
+def named_postures(
+    hand: Hand, grasps: Grasps, force: float, kp: float | None
+) -> tuple[Squeeze, dict[str, dict[str, Float[Tensor, "g"]]]]:
+    """Return the squeeze of grasps, and all joints [rad] by name in "pregrasp", "grasp" and "squeeze", on the CPU."""
+    hand, grasps = hand.to("cpu"), grasps.to("cpu")
+    squeezed = squeeze(hand, grasps, force, kp)
+    postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}
+    return squeezed, {name: hand.expand(joints) for name, joints in postures.items()}
+
+
 def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:
     """Return the rotation of a pose as a unit quaternion (w, x, y, z)."""
     from scipy.spatial.transform import Rotation
@@ -129,13 +136,13 @@ def format_keyframes(
     >>> text.count("<key ")
     4
     """
-    hand, grasps = hand.to("cpu"), grasps.to("cpu")
-    squeezed, urdf = squeeze(hand, grasps, force, kp), read_urdf(hand.urdf_path)
+    grasps = grasps.to("cpu")
+    _, postures = named_postures(hand, grasps, force, kp)
     root = ET.Element("mujoco", model=hand.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     tags = "custom", "worldbody", "actuator", "keyframe"
     custom, world, actuator, keyframes = (ET.SubElement(root, tag) for tag in tags)
-    palm = add_links(world, urdf, np.eye(4))
+    palm = add_links(world, read_urdf(hand.urdf_path), np.eye(4))
     palm.insert(0, ET.Element("freejoint", name="hand"))
     order = [joint.attrib["name"] for joint in palm.iter("joint")]  # bodies as they nest, as MuJoCo numbers them
     for name in order:
@@ -144,19 +151,17 @@ def format_keyframes(
     free = "hand/x hand/y hand/z hand/qw hand/qx hand/qy hand/qz".split()
     ET.SubElement(custom, "text", name="qpos", data=" ".join([*free, *order]))
     ET.SubElement(custom, "text", name="ctrl", data=" ".join(order))
-    opened, closed = hand.expand(grasps.pregrasp.double()), hand.expand(grasps.joints.double())
-    keys = (
-        ("approach", APPROACH_DISTANCE, opened, opened),
-        ("pregrasp", 0.0, opened, opened),
-        ("grasp", 0.0, closed, closed),
-        ("squeeze", 0.0, closed, hand.expand(squeezed.joints)),
+    keys = (  # name, distance from the pose, joints, targets
+        ("approach", APPROACH_DISTANCE, "pregrasp", "pregrasp"),
+        ("pregrasp", 0.0, "pregrasp", "pregrasp"),
+        ("grasp", 0.0, "grasp", "grasp"),
+        ("squeeze", 0.0, "grasp", "squeeze"),
     )
-    for row in range(len(grasps)):
-        pose = grasps.obj_from_hand[row]
-        for name, distance, joints, targets in keys:
+    for row, pose in enumerate(grasps.obj_from_hand):
+        for name, distance, state, targets in keys:
             position = pose[:3, 3] - distance * grasps.approach[row]
-            state = [*position.tolist(), *quaternion(pose), *(float(joints[joint][row]) for joint in order)]
-            control = format_numbers(float(targets[joint][row]) for joint in order)
-            ET.SubElement(keyframes, "key", name=f"grasp_{row}_{name}", qpos=format_numbers(state), ctrl=control)
+            joints, control = ([float(postures[x][joint][row]) for joint in order] for x in (state, targets))
+            qpos = format_numbers([*position.tolist(), *quaternion(pose), *joints])
+            ET.SubElement(keyframes, "key", name=f"grasp_{row}_{name}", qpos=qpos, ctrl=format_numbers(control))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"

@@ -1,16 +1,16 @@
 """Export of grasps as ROS 2 messages in YAML: moveit_msgs/Grasp and trajectory_msgs/JointTrajectory."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any
 
+import yaml
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Positive, Range, checked
-from torchgrasp.control.forces import squeeze
 from torchgrasp.control.paper.closings import POSE_TIME
-from torchgrasp.export.postures import quaternion
+from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE
@@ -18,6 +18,21 @@ from torchgrasp.values import Grasps
 
 OBJECT_FRAME = "object"
 """Name of the object's frame in the messages: the frame of the cloud; publish a transform of that name."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes numbers with nine decimals [nm, nrad]: YAML 1.1 takes 1e-05 for a text, so none has an exponent."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write equal lists anew."""
+        return True
+
+    def represent_number(self, number: float) -> yaml.ScalarNode:
+        """Return a float as a scalar of YAML."""
+        return self.represent_scalar("tag:yaml.org,2002:float", f"{number:.9f}" if math.isfinite(number) else ".nan")
+
+
+_Dumper.add_representer(float, _Dumper.represent_number)
 
 
 @checked
@@ -41,12 +56,11 @@ def format_moveit(
     >>> print(text.splitlines()[2])
     # the hand's frame is link 'palm' of hand.urdf; joints in the order of joint_names
     """
-    root = read_urdf(hand.urdf_path).root
     messages = [
         {
             "id": f"grasp_{row}",
-            "pre_grasp_posture": _posture(root, points[:1]),
-            "grasp_posture": _posture(root, points[1:]),
+            "pre_grasp_posture": trajectory | {"points": trajectory["points"][:1]},
+            "grasp_posture": trajectory | {"points": trajectory["points"][1:]},
             "grasp_pose": {"header": {"frame_id": OBJECT_FRAME}, "pose": _pose(grasps.obj_from_hand[row])},
             "grasp_quality": float(grasps.success[row]),
             "pre_grasp_approach": _translation(grasps.approach[row]),
@@ -54,9 +68,9 @@ def format_moveit(
             "max_contact_force": force,
             "allowed_touch_objects": [],
         }
-        for row, points in enumerate(_points(hand, grasps, force, kp))
+        for row, trajectory in enumerate(_trajectories(hand, grasps, force, kp))
     ]
-    return _heading(hand, root, "a list of moveit_msgs/Grasp") + _document(messages)
+    return _document(hand, "a list of moveit_msgs/Grasp", [messages])
 
 
 @checked
@@ -74,39 +88,26 @@ def format_trajectories(
     >>> text.count("time_from_start")
     3
     """
-    root = read_urdf(hand.urdf_path).root
-    documents = [_document(_posture(root, points)) for points in _points(hand, grasps, force, kp)]
-    return _heading(hand, root, "a trajectory_msgs/JointTrajectory for each grasp") + "---\n".join(documents)
+    trajectories = _trajectories(hand, grasps, force, kp)
+    return _document(hand, "a trajectory_msgs/JointTrajectory for each grasp", trajectories)
 
 
-def _points(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> Iterator[list[dict[str, Any]]]:
-    """Yield the trajectory points of each grasp, with every joint by name."""
-    hand, grasps = hand.to("cpu"), grasps.to("cpu")
-    squeezed = squeeze(hand, grasps, force, kp)
-    postures = [hand.expand(q.double()) for q in (grasps.pregrasp, grasps.joints, squeezed.joints)]
+def _trajectories(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> Iterator[dict[str, Any]]:
+    """Yield a trajectory_msgs/JointTrajectory of each grasp, with every joint of the hand."""
+    squeezed, postures = named_postures(hand, grasps, force, kp)
+    names, root = list(hand.tree.joint_names), read_urdf(hand.urdf_path).root
     for row in range(len(grasps)):
         torque = dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True))
-        points = list[dict[str, Any]]()
-        for k, posture in enumerate(postures):
-            seconds = k * POSE_TIME
-            nanoseconds = round(1e9 * (seconds - math.floor(seconds)))
-            points.append(
-                {
-                    "positions": {joint: float(q[row]) for joint, q in posture.items()},
-                    "effort": {joint: torque.get(joint, 0.0) for joint in posture} if k == 2 else {},
-                    "time_from_start": {"sec": math.floor(seconds), "nanosec": nanoseconds},
-                }
-            )
-        yield points
-
-
-def _posture(root: str, points: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return a trajectory_msgs/JointTrajectory."""
-    listed = [
-        {key: list(value.values()) if key != "time_from_start" else value for key, value in point.items()}
-        for point in points
-    ]
-    return {"header": {"frame_id": root}, "joint_names": list(points[0]["positions"]), "points": listed}
+        efforts = [], [], [torque.get(joint, 0.0) for joint in names]
+        points = [
+            {
+                "positions": [float(posture[joint][row]) for joint in names],
+                "effort": effort,
+                "time_from_start": {"sec": 0, "nanosec": round(1e9 * k * POSE_TIME)},
+            }
+            for k, (posture, effort) in enumerate(zip(postures.values(), efforts, strict=True))
+        ]
+        yield {"header": {"frame_id": root}, "joint_names": names, "points": points}
 
 
 def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
@@ -123,39 +124,12 @@ def _translation(direction: Float[Tensor, "3"]) -> dict[str, Any]:
     return {"direction": stamped, "desired_distance": APPROACH_DISTANCE, "min_distance": APPROACH_DISTANCE}
 
 
-def _heading(hand: Hand, root: str, what: str) -> str:
-    """Return comment lines that explain the numbers."""
-    return (
+def _document(hand: Hand, what: str, documents: Iterable[Any]) -> str:
+    """Return plain values as YAML, below comment lines that explain the numbers."""
+    root, file = read_urdf(hand.urdf_path).root, hand.urdf_path.name
+    heading = (
         f"# {what}, for the {hand.name} hand, by torchgrasp\n"
         f"# metres, radians, newtons, N m; quaternions by name; frame {OBJECT_FRAME!r}: that of the planned cloud\n"
-        f"# the hand's frame is link {root!r} of {hand.urdf_path.name}; joints in the order of joint_names\n"
+        f"# the hand's frame is link {root!r} of {file}; joints in the order of joint_names\n"
     )
-
-
-def _document(value: Any) -> str:
-    """Return plain values as a YAML document in block style; lists of scalars take one line."""
-    return "\n".join(_lines(value)) + "\n"
-
-
-def _lines(value: Any) -> list[str]:
-    """Return the YAML lines of a mapping, or of a list of mappings."""
-    lines = list[str]()
-    if isinstance(value, dict):
-        for key, item in value.items():
-            nested = isinstance(item, dict) or (isinstance(item, list) and any(isinstance(x, dict) for x in item))
-            lines += [f"{key}:", *(f"  {line}" for line in _lines(item))] if nested else [f"{key}: {_scalar(item)}"]
-        return lines
-    for item in value:
-        first, *rest = _lines(item)
-        lines += [f"- {first}", *(f"  {line}" for line in rest)]
-    return lines or ["[]"]
-
-
-def _scalar(value: Any) -> str:
-    """Return a scalar, or a list of scalars, as YAML on one line."""
-    digits = 9  # decimals of a number [nm, nrad]: YAML 1.1 takes 1e-05 for a text, so none has an exponent
-    if isinstance(value, list):
-        return f"[{', '.join(map(_scalar, value))}]"
-    if isinstance(value, float):
-        return f"{value:.{digits}f}" if math.isfinite(value) else ".nan"
-    return str(value) if isinstance(value, int) else f'"{value}"'
+    return heading + yaml.dump_all(documents, None, _Dumper, default_flow_style=None, width=math.inf, sort_keys=False)

@@ -30,10 +30,12 @@ class Field(NamedTuple):
         shown = text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}..."
         return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
 
-    def entries(self) -> "dict[str, Field]":
-        """Return the fields of a JSON object by name."""
+    def entries(self, *required: str) -> "dict[str, Field]":
+        """Return the fields of a JSON object by name, those that are `required` among them."""
         if not isinstance(self.value, dict):
             raise self.wrong("an object { }")
+        if missing := [name for name in required if name not in self.value]:
+            raise self.wrong(f"an object with {missing[0]!r}")
         within = f"{self.place}." if self.place else ""
         return {key: Field(self.path, f"{within}{key}", value, self.refuse) for key, value in self.value.items()}
 

@@ -44,7 +44,27 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))
     1
     """
-    return _cut(read_mesh(mesh), cache)
+    import trimesh
+
+    mesh = read_mesh(mesh)
+    if mesh.is_convex:
+        return [hull(mesh.vertices)]
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    path = (home / "torchgrasp" if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
+    parts = list[trimesh.Trimesh]()
+    if path.is_file():
+        try:
+            parts = _load(path, mesh)
+        except (ModelFileError, ValueError):
+            _log.warning("%s is damaged and will be made anew", path)
+    if not parts:
+        pieces = decompose(mesh, {"threshold": 0.05, **_SEARCH})
+        parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
+        try:
+            _save(parts, path)
+        except OutputError as error:
+            _log.warning("convex parts are not kept: %s", error)
+    return [part for part in parts if part.volume > LEAST_VOLUME]
 
 
 def read_solid(
@@ -52,29 +72,7 @@ def read_solid(
 ) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
     """Return a closed mesh and the convex parts that make it up; `parts` None: they are computed."""
     mesh = read_mesh(mesh)
-    return mesh, _cut(mesh, None) if parts is None else check_parts(parts)
-
-
-def _cut(mesh: "trimesh.Trimesh", cache: Path | str | None) -> "list[trimesh.Trimesh]":
-    """Return the convex parts of a checked mesh, from the cache or decomposed anew."""
-    import trimesh
-
-    if mesh.is_convex:
-        return [hull(mesh.vertices)]
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    path = (home / "torchgrasp" if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
-    if path.is_file():
-        try:
-            return _filled(_load(path, mesh))
-        except (ModelFileError, ValueError):
-            _log.warning("%s is damaged and will be made anew", path)
-    pieces = decompose(mesh, {"threshold": 0.05, **_SEARCH})
-    parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
-    try:
-        _save(parts, path)
-    except OutputError as error:
-        _log.warning("convex parts are not kept: %s", error)
-    return _filled(parts)
+    return mesh, convex_parts(mesh) if parts is None else check_parts(parts)
 
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
@@ -84,11 +82,6 @@ def hull(corners: np.ndarray) -> "trimesh.Trimesh":
     with np.errstate(divide="ignore", invalid="ignore"):
         body = trimesh.convex.convex_hull(corners)
         return body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
-
-
-def _filled(parts: "list[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the parts without slivers of no volume."""
-    return [part for part in parts if part.volume > LEAST_VOLUME]
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":

@@ -1,7 +1,8 @@
 """A simulated scene in MuJoCo, and its model as MJCF."""
 
+import functools
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf
-from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, StepContacts
+from torchgrasp.sim.scene import STILL, ContactPoint, Scene
 from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, pair_masks
 
 OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
@@ -51,7 +52,9 @@ class MujocoScene(Scene):
         self.root = model.body(urdf.root).id
         self.tips = [model.body(name).id for name in spec.tip_links]
         self.neighbours = [model.body(NEIGHBOUR.format(k)).id for k in range(len(spec.neighbours))]
-        self._map_contacts()
+        self._body_of = model.geom_bodyid.tolist()
+        parents = model.body_parentid.tolist()
+        self._map_contacts([0], (parents[tip] if model.body_jntnum[tip] == 0 else None for tip in self.tips))
         data.qpos[self._positions] = [spec.joints[name] for name in self.joint_names]
         self.drive(data.qpos[self._positions])
         for slide in spec.slides:
@@ -59,41 +62,22 @@ class MujocoScene(Scene):
             self._move_mount(slide.name, slide.start, 0.0)
         mujoco.mj_step1(model, data)
 
-    def _map_contacts(self) -> None:
-        """Map geoms to bodies, fingertips and their parent bodies to fingers, and other bodies to kinds."""
-        model = self.model
-        self._body_of = model.geom_bodyid.tolist()
-        self._kind_of = {0: TABLETOP, self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
-        self._finger_of = {body: i for i, body in enumerate(self.tips)}
-        for i, tip in enumerate(self.tips):
-            if model.body_jntnum[tip] == 0:
-                self._finger_of.setdefault(int(model.body_parentid[tip]), i)
-
-    def step(self) -> StepContacts:
-        """Advance by one timestep and report the contacts between fingertips and object."""
-        contacts = StepContacts.none(len(self.tips))
+    def _advance(self) -> Iterator[tuple[int, int, Callable[[], list[ContactPoint]]]]:
+        """Advance by one timestep; yield two bodies that touch, and the function that reads their contact point."""
         if self._diverged():
-            return contacts
+            return
         self._mujoco.mj_step2(self.model, self.data)
-        wrench, found = np.zeros(6), self.data.contact
-        for k, shapes in enumerate(found.geom.tolist()):
-            first, second = (self._body_of[shape] for shape in shapes)
-            if (first in self._kind_of) == (second in self._kind_of):
-                continue
-            link, other, sign = (second, first, -1.0) if first in self._kind_of else (first, second, 1.0)
-            self._mujoco.mj_contactForce(self.model, self.data, k, wrench)
-            finger = self._finger_of.get(link) if other == self.body else None
-            if finger is None:
-                contacts.stray[self._kind_of[other]] += max(float(wrench[0]), 0.0) * self.timestep
-            elif wrench[0] > 0.0:
-                contacts.finger[finger] = True
-                if link == self.tips[finger]:
-                    axes = found.frame[k].reshape(3, 3)  # in rows; the first points from the first body to the second
-                    size = float(wrench[0]) * self.timestep
-                    contacts.add(finger, sign * size * axes[0], size, found.pos[k])
-                    contacts.force[finger] += sign * (wrench[:3] @ axes)
+        for k, (first, second) in enumerate(self.data.contact.geom.tolist()):
+            yield self._body_of[first], self._body_of[second], functools.partial(self._read, k)
         self._mujoco.mj_step1(self.model, self.data)
-        return contacts
+
+    def _read(self, k: int) -> list[ContactPoint]:
+        """Return the point of contact k."""
+        wrench, found = np.zeros(6), self.data.contact
+        self._mujoco.mj_contactForce(self.model, self.data, k, wrench)
+        axes = found.frame[k].reshape(3, 3)  # in rows; the first points from the first body to the second
+        size = max(float(wrench[0]), 0.0) * self.timestep
+        return [ContactPoint(size * axes[0], size, found.pos[k], wrench[:3] @ axes)]
 
     def drive(self, targets: np.ndarray) -> None:
         """Set the target [rad] of every driven joint."""
@@ -118,7 +102,7 @@ class MujocoScene(Scene):
         """Return the largest penetration depth [m] of the hand, itself included."""
         deepest = 0.0
         for (first, second), distance in zip(self.data.contact.geom, self.data.contact.dist, strict=True):
-            if self._body_of[first] not in self._kind_of or self._body_of[second] not in self._kind_of:
+            if not {self._body_of[first], self._body_of[second]} <= self._place_of.keys():
                 deepest = max(deepest, -float(distance))
         return deepest
 

@@ -11,20 +11,19 @@ Settings that differ from SAPIEN's defaults:
 PhysX keeps 255 faces of a convex part.
 """
 
+import functools
 import warnings
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
 from torchgrasp.errors import MissingExtra
 from torchgrasp.files import temporary_folder, write_file
-from torchgrasp.sim.scene import NEIGHBOURS, STILL, TABLETOP, TARGET, Scene, StepContacts
+from torchgrasp.sim.scene import STILL, ContactPoint, Scene, StepContacts
 from torchgrasp.sim.scene_spec import (
-    APPROACH_JOINT,
     ARMATURE,
-    LIFT_JOINT,
     MOUNT_DRIVE,
-    SHIFT_JOINTS,
     TABLE,
     WRIST_JOINT,
     Body,
@@ -32,34 +31,6 @@ from torchgrasp.sim.scene_spec import (
     mounted_urdf,
     pair_masks,
 )
-
-
-class Built(NamedTuple):
-    """The handles of SAPIEN's objects in a scene."""
-
-    system: Any
-    scene: Any
-    body: Any
-    hand: Any
-    neighbours: list[Any]
-
-
-def build(spec: SceneSpec) -> Built:
-    """Return a new SAPIEN scene with table, object and hand at their initial poses.
-
-    Raises:
-        BadArgument: a joint of the hand without a position or drive.
-        MissingExtra: SAPIEN is not installed.
-    """
-    sapien, physx = import_sapien()
-    system, scene = open_world(sapien, physx, spec.gravity, spec.timestep)
-    material = physx.PhysxMaterial(spec.friction, spec.friction, 0.0)
-    if spec.table:
-        place(sapien, scene, "table", table(physx, material), spec.table_height - TABLE[2] / 2)
-    bodies = [rigid_body(sapien, physx, material, body, spec.patch) for body in (spec.body, *spec.neighbours)]
-    for k, body in enumerate(bodies):
-        place(sapien, scene, "neighbour" if k else "object", body)
-    return Built(system, scene, bodies[0], _hand(scene, material, spec), bodies[1:])
 
 
 def open_world(sapien: Any, physx: Any, gravity: float, timestep: float) -> tuple[Any, Any]:
@@ -159,81 +130,63 @@ class SapienScene(Scene):
 
     def __init__(self, spec: SceneSpec) -> None:
         super().__init__(spec)
-        self.system, self.scene, self.body, self.hand, self.neighbours = build(spec)
-        active = self.hand.active_joints
-        self._mount = {j.name: j for j in active if j.name in (LIFT_JOINT, APPROACH_JOINT, *SHIFT_JOINTS)}
-        self._places = [k for k, j in enumerate(active) if j.name not in self._mount]
-        self._driven = [active[k] for k in self._places]
-        self.joint_names = tuple(j.name for j in self._driven)
+        sapien, physx = import_sapien()
+        self.system, self.scene = open_world(sapien, physx, spec.gravity, spec.timestep)
+        material = physx.PhysxMaterial(spec.friction, spec.friction, 0.0)
+        if spec.table:
+            place(sapien, self.scene, "table", table(physx, material), spec.table_height - TABLE[2] / 2)
+        bodies = [rigid_body(sapien, physx, material, body, spec.patch) for body in (spec.body, *spec.neighbours)]
+        for k, body in enumerate(bodies):
+            place(sapien, self.scene, "neighbour" if k else "object", body)
+        self.body, *self.neighbours = bodies
+        self.hand = _hand(self.scene, material, spec)
         links = {link.name: link for link in self.hand.links}
         self.tips = [links[name] for name in spec.tip_links]
         self.root = next(j.child_link for j in self.hand.joints if j.name == WRIST_JOINT)
+        carriers = (tip.parent if tip.joint.dof == 0 else None for tip in self.tips)
+        self._map_contacts(self.system.rigid_static_components, carriers)
+        self._map_joints(spec)
         self.pull(STILL)
-        self._map_contacts()
-        self._map_joints()
 
-    def _map_contacts(self) -> None:
-        """Map tips and their parent links to fingers, and other bodies to their index in `StepContacts.stray`."""
-        self._links = set(self.hand.links)
-        self._finger_of = {link: i for i, link in enumerate(self.tips)}
-        self._place_of = {self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
-        self._place_of |= dict.fromkeys(self.system.rigid_static_components, TABLETOP)
-        for i, tip in enumerate(self.tips):
-            if tip.joint.dof == 0:
-                self._finger_of.setdefault(tip.parent, i)
-
-    def _map_joints(self) -> None:
-        """Prepare the Jacobian: the frame of each driven joint in its link, and which tips the joint moves."""
+    def _map_joints(self, spec: SceneSpec) -> None:
+        """Sort the joints of hand and mount; store the frames of the driven joints and the tips that they move."""
+        active, slides = self.hand.active_joints, {slide.name for slide in spec.slides}
+        self._mount = {j.name: j for j in active if j.name in slides}
+        self._places = [k for k, j in enumerate(active) if j.name not in slides]
+        self._driven = [active[k] for k in self._places]
+        self.joint_names = tuple(j.name for j in self._driven)
         self._frames = np.array([_matrix(j.pose_in_child) for j in self._driven])
         self._children = [j.child_link for j in self._driven]
         self._slides = np.array([j.type == "prismatic" for j in self._driven])
         self._moves = np.zeros((len(self.tips), len(self._driven)))
-        for t, tip in enumerate(self.tips):
-            link = tip
+        for t, link in enumerate(self.tips):
             while link is not None:
-                for k, joint in enumerate(self._driven):
-                    if joint.child_link.name == link.name:
-                        self._moves[t, k] = 1.0
+                self._moves[t, [child is link for child in self._children]] = 1.0
                 link = link.parent
         self._sensor_axes = [_matrix(tip.joint.pose_in_child)[:3, :3] for tip in self.tips]
         self._tip_index = [self.hand.links.index(tip) for tip in self.tips]
 
-    def step(self) -> StepContacts:
-        """Advance by one timestep and report the contacts between fingertips and object."""
+    def _advance(self) -> Iterator[tuple[Any, Any, Callable[[], Iterable[ContactPoint]]]]:
+        """Advance by one timestep; yield two bodies that touch, and the function that reads their contact points."""
         if self._pulled:
             self.body.add_force_torque(self._force, self._torque)
         self.scene.step()
-        contacts = StepContacts.none(len(self.tips))
         for contact in self.system.get_contacts():
-            first, second = contact.bodies
-            if (first in self._links) == (second in self._links):
-                continue
-            link, other, sign = (first, second, -1.0) if first in self._links else (second, first, 1.0)
-            finger = self._finger_of.get(link) if other is self.body else None
-            if finger is None:
-                contacts.stray[self._place_of[other]] += sum(_length(point.impulse) for point in contact.points)
-                continue
-            for point in contact.points:
-                impulse = point.impulse
-                size = _length(impulse)
-                if size > 0.0:
-                    contacts.finger[finger] = True
-                    if link is self.tips[finger]:
-                        contacts.add(finger, sign * impulse, size, point.position)
-        self._add_forces(contacts)
-        return contacts
+            yield *contact.bodies, functools.partial(_read, contact)
 
-    def _add_forces(self, contacts: StepContacts) -> None:
-        """Add the force of each touching fingertip, as a sensor at the base of the tip measures it.
+    def step(self) -> StepContacts:
+        """Advance by one timestep and report the contacts, with the forces that sensors at the tips' bases measure.
 
         SAPIEN reports contacts without friction, but the complete wrench at each link's joint, in the joint's frame.
         """
+        contacts = super().step()
         touching = [i for i, weight in enumerate(contacts.weight.tolist()) if weight > 0.0]
         if touching:
             wrenches = self.hand.get_link_incoming_joint_forces().astype(float)
             for i in touching:
                 world_from_sensor = self._pose(self.tips[i])[:3, :3].dot(self._sensor_axes[i])
                 contacts.force[i] = world_from_sensor.dot(wrenches[self._tip_index[i], :3])
+        return contacts
 
     def drive(self, targets: np.ndarray) -> None:
         """Set the target [rad] of every driven joint."""
@@ -266,11 +219,8 @@ class SapienScene(Scene):
         self.scene.step()
         for body in bodies:
             body.disable_gravity = False
-        deepest = 0.0
-        for contact in self.system.get_contacts():
-            if not self._links.isdisjoint(contact.bodies):
-                deepest = max([deepest, *(-p.separation for p in contact.points)])
-        return float(deepest)
+        touching = [c for c in self.system.get_contacts() if not set(c.bodies) <= self._place_of.keys()]
+        return max((float(-point.separation) for contact in touching for point in contact.points), default=0.0)
 
     def _pose(self, body: Any) -> np.ndarray:
         """Return the pose (4, 4) of a body of the scene."""
@@ -287,7 +237,8 @@ def _matrix(pose: Any) -> np.ndarray:
     return pose.to_transformation_matrix().astype(float)
 
 
-def _length(impulse: np.ndarray) -> float:
-    """Return the length of a vector, faster than `np.linalg.norm`."""
-    squared = impulse.dot(impulse)
-    return float(np.sqrt(squared)) if squared else 0.0
+def _read(contact: Any) -> Iterator[ContactPoint]:
+    """Yield the points of a contact; SAPIEN reports the impulse on its first body."""
+    for point in contact.points:
+        impulse = point.impulse
+        yield ContactPoint(-impulse, float(np.sqrt(impulse.dot(impulse))), point.position)

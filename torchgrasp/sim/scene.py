@@ -5,11 +5,12 @@ Every trial opens a fresh scene: only then are two runs bitwise equal. The world
 
 import abc
 import dataclasses
-from typing import Annotated, Any
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from torchgrasp.checks import Count, Range, checked
+from torchgrasp.checks import Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
 
@@ -47,24 +48,17 @@ class StepContacts:
         impulse, moment, force = np.zeros((3, fingers, 3))
         return cls(impulse, moment, np.zeros(fingers), np.zeros(fingers, dtype=bool), force, np.zeros(3))
 
-    @checked
-    def add(self, finger: Annotated[int, Range(0, 1000)], impulse: np.ndarray, size: float, point: np.ndarray) -> None:
-        """Add a contact of one fingertip: its impulse [N s], the size of the impulse, and its position [m]."""
-        if finger >= len(self.weight):
-            raise BadArgument("finger", finger, f"one of {len(self.weight)}")
-        check_vector("impulse", impulse)
-        check_vector("point", point)
-        self.impulse[finger] += impulse
-        self.moment[finger] += size * point
-        self.weight[finger] += size
 
-    @checked
-    def accumulate(self, step: "StepContacts", count: Count) -> None:
-        """Add the contacts of one of `count` steps: impulses are summed, forces are averaged."""
-        np.add(self.impulse, step.impulse, out=self.impulse)
-        np.add(self.moment, step.moment, out=self.moment)
-        np.add(self.weight, step.weight, out=self.weight)
-        np.add(self.force, step.force / count, out=self.force)
+class ContactPoint(NamedTuple):
+    """A point where two bodies touch: impulse on the second body (3,) [N s] and its size, and position (3,) [m].
+
+    `force` (3,) [N] on the second body includes friction; 0 if the simulator reports it elsewhere.
+    """
+
+    impulse: np.ndarray
+    size: float
+    place: np.ndarray
+    force: np.ndarray | float = 0.0
 
 
 class Scene(abc.ABC):
@@ -72,7 +66,7 @@ class Scene(abc.ABC):
 
     Arrays are in the world's axes; joints are in the order of `joint_names`. `centre` [m] is the object's centre of
     mass in its own frame, `timestep` is in seconds. A simulator's subclass sets `joint_names` and the handles of
-    bodies.
+    bodies, and calls `_map_contacts`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand, pose = load_object("jug"), load_hand("barrett"), np.eye(4)
@@ -103,9 +97,42 @@ class Scene(abc.ABC):
     def __init__(self, spec: SceneSpec) -> None:
         self.timestep, self.centre = spec.timestep, np.asarray(spec.mesh.center_mass, float)
 
-    @abc.abstractmethod
+    def _map_contacts(self, tables: Iterable[Any], carriers: Iterable[Any]) -> None:
+        """Map bodies to their place in `StepContacts.stray`, and links to fingers.
+
+        `carriers` holds for each fingertip the link that carries it rigidly, or None.
+        """
+        self._place_of = {self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
+        self._place_of |= dict.fromkeys(tables, TABLETOP)
+        self._finger_of = {tip: i for i, tip in enumerate(self.tips)}
+        for i, carrier in enumerate(carriers):
+            if carrier is not None:
+                self._finger_of.setdefault(carrier, i)
+
     def step(self) -> StepContacts:
         """Advance by one timestep and report the contacts between fingertips and object."""
+        contacts = StepContacts.none(len(self.tips))
+        for first, second, read in self._advance():
+            if (first in self._place_of) == (second in self._place_of):
+                continue
+            link, other, sign = (second, first, -1.0) if first in self._place_of else (first, second, 1.0)
+            finger = self._finger_of.get(link) if other == self.body else None
+            if finger is None:
+                contacts.stray[self._place_of[other]] += sum(point.size for point in read())
+                continue
+            for impulse, size, place, force in read():
+                if size > 0.0:
+                    contacts.finger[finger] = True
+                    if link == self.tips[finger]:
+                        contacts.impulse[finger] += sign * impulse
+                        contacts.moment[finger] += size * place
+                        contacts.weight[finger] += size
+                        contacts.force[finger] += sign * force
+        return contacts
+
+    @abc.abstractmethod
+    def _advance(self) -> Iterable[tuple[Any, Any, Callable[[], Iterable[ContactPoint]]]]:
+        """Advance by one timestep; yield two bodies that touch, and the function that reads their contact points."""
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:

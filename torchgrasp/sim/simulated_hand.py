@@ -100,7 +100,10 @@ class SimulatedHand:
         for _ in range(self.substeps):
             step = self.scene.step()
             self.steps += 1
-            contacts.accumulate(step, self.substeps)
+            contacts.impulse[:] += step.impulse
+            contacts.moment[:] += step.moment
+            contacts.weight[:] += step.weight
+            contacts.force[:] += step.force / self.substeps  # the mean force of the tick
             self.finger = step.finger
             for i, weight in enumerate(step.weight.tolist()):
                 if weight > 0.0:
