@@ -10,7 +10,6 @@ from torchgrasp.geometry.linalg import (
     farthest_points,
     limit_norm,
     solve_least_squares,
-    squared_distance,
     squared_mahalanobis,
     unit,
     unit_of_any,
@@ -80,7 +79,7 @@ def test_each_farthest_point_is_the_farthest_from_those_before_it(generator):
 def test_farthest_points_are_the_same_however_distances_are_measured(generator):
     p = torch.rand(200, 3, generator=generator, dtype=torch.float64).round(decimals=1)  # with ties
     picks = farthest_points(p, 40, first=3, tie=1e-9)
-    assert torch.equal(picks, farthest_points(p, 40, first=3, tie=1e-9, distance=lambda x, y: squared_distance(x, y)))
+    assert torch.equal(picks, farthest_points(p, 40, first=3, tie=1e-9, distance=lambda x, y: (x - y).square().sum(-1)))
 
 
 def test_of_points_that_tie_the_first_is_the_farthest():

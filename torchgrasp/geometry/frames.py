@@ -67,14 +67,7 @@ def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """Return the angle [rad] of a rotation, accurate near 0 and near pi."""
-    axis = torch.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        -1,
-    )
+    axis = (rotation - rotation.mT)[..., [2, 0, 1], [1, 2, 0]]
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     return torch.atan2(torch.linalg.vector_norm(axis, dim=-1), trace - 1)
 
@@ -100,9 +93,6 @@ def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
 
     The origin is the centroid of the contacts (Eq. 16). The x axis points from the first contact to the third. The z
     axis is the normal of their plane.
-
-    Args:
-        points: contacts or fingertips [m] in the order of the fingers.
 
     Raises:
         DegenerateContacts: the contacts lie nearly on a line.

@@ -24,20 +24,15 @@ def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
     return unit(v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent))  # a power of two rounds nothing
 
 
-def across(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return two unit vectors across a unit vector, which with it make a right-handed frame (first, second, normal)."""
-    first = unit(torch.linalg.cross(normal, torch.eye(3).to(normal)[normal.abs().argmin()]))
+def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
+    """Return two unit vectors across each unit vector: (first, second, normal) is a right-handed frame."""
+    helper = torch.zeros_like(normal).scatter(-1, normal.abs().argmin(-1, keepdim=True), 1.0)
+    first = unit(torch.linalg.cross(normal, helper))
     return first, torch.linalg.cross(normal, first)
 
 
 def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:
-    """Return n unit vectors spread evenly over the sphere, from +z to -z, in float64.
-
-    Args:
-        n: number of vectors.
-        angle: rotation about z from one vector to the next [rad]: `GOLDEN_ANGLE`, in either sense.
-        start: rotation of the first vector, in units of `angle`.
-    """
+    """Return n unit vectors spread evenly over the sphere, from +z to -z, each rotated by `angle` [rad] about z."""
     k = torch.arange(n, dtype=torch.float64)
     z = 1 - (2 * k + 1) / n
     rotation = angle * (k + start)
@@ -51,21 +46,13 @@ def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"
 
 
 def solve_least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]) -> Float[Tensor, "k"]:
-    """Return the shortest x that minimises |rows x - values|, by the pseudo-inverse.
-
-    `torch.linalg.lstsq` is not used: on a CPU its column pivots are undefined, so the last digits differ from call to
-    call.
-    """
+    """Return the shortest x that minimises |rows x - values|, by the pseudo-inverse."""
+    # On a CPU the column pivots of torch.linalg.lstsq are undefined: its last digits differ from call to call.
     return torch.linalg.pinv(rows) @ values
 
 
 def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tensor, "*b n n"]:
-    """Return the lower Cholesky factor, without jitter.
-
-    Raises:
-        IndefiniteCovariance: the matrix is not positive definite; the message names `what`, the smallest eigenvalue and
-            the `fix`.
-    """
+    """Return the lower Cholesky factor, without jitter; else raise `IndefiniteCovariance` with `what` and `fix`."""
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not bool((info == 0).all() & torch.isfinite(factor).all()):  # one wait for the device
         finite = bool(torch.isfinite(matrix).all())
@@ -80,52 +67,41 @@ def squared_mahalanobis(difference: Float[Tensor, "*b d"], factor: Float[Tensor,
     return (whitened * whitened).sum(-1)
 
 
-def squared_distance(points: Float[Tensor, "n d"], one: Float[Tensor, "d"]) -> Float[Tensor, "n"]:
-    """Return the squared Euclidean distance of each point from a single point."""
-    return (points - one).square().sum(-1)
-
-
 def farthest_points(
     points: Float[Tensor, "n *d"],
     count: int,
     first: int = 0,
     tie: float = 0.0,
-    distance: Callable[[Tensor, Tensor], Tensor] = squared_distance,
+    distance: Callable[[Tensor, Tensor], Tensor] | None = None,
     before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
     """Return the indices of at most `count` points, each the farthest from those before (farthest-point sampling).
 
     Args:
-        points: any values that `distance` compares.
+        points: vectors, or any values that `distance` compares.
         count: the number of points.
         first: index of the first point.
         tie: relative difference up to which distances count as equal; of equally far points the first is taken.
-        distance: function that returns the distance of each point from a single point.
+        distance: function that returns the distance of each point from a single point; None: the Euclidean distance.
         before: points that count as already picked and are not returned; `first` is then not used.
     """
-    if distance is squared_distance and before is None and points.device.type == "cpu" and points.ndim == 2:
-        return torch.from_numpy(_farthest_on_cpu(points.detach().numpy(), min(count, len(points)), first, tie))
-    picks = torch.full((min(count, len(points)),), first, dtype=torch.long, device=points.device)
-    nearest = torch.full((len(points),), torch.inf, dtype=points.dtype, device=points.device)
-    known = points[:0] if before is None else before
-    for one in known:
-        nearest = torch.minimum(nearest, distance(points, one))
-    for k in range(0 if len(known) else 1, len(picks)):
+    every = points.detach().cpu()
+    x = np.ascontiguousarray(every.numpy().T)  # NumPy is an order of magnitude faster than torch for few points
+
+    def gaps(one: Tensor) -> np.ndarray:
+        if distance is not None:
+            return distance(every, one).numpy()
+        off = x - one.numpy()[:, None]
+        return np.einsum("in,in->n", off, off)
+
+    picks, nearest = np.full(min(count, len(every)), first), np.full(len(every), np.inf, dtype=x.dtype)
+    for one in every[:0] if before is None else before.detach().cpu():
+        np.minimum(nearest, gaps(one), out=nearest)
+    for k in range(0 if before is not None and len(before) else 1, len(picks)):
         if k:
-            nearest = torch.minimum(nearest, distance(points, points.index_select(0, picks[k - 1 : k])[0]))
-        picks[k] = (nearest >= (1.0 - tie) * nearest.max()).int().argmax()  # the first of the largest
-    return picks
-
-
-def _farthest_on_cpu(points: np.ndarray, count: int, first: int, tie: float) -> np.ndarray:
-    """Return `farthest_points` in NumPy, which is faster than torch for few points."""
-    x, picks = np.ascontiguousarray(points.T), np.full(count, first)
-    nearest = np.full(len(points), np.inf, dtype=x.dtype)
-    for k in range(1, count):
-        off = x - x[:, picks[k - 1], None]
-        np.minimum(nearest, np.einsum("in,in->n", off, off), out=nearest)
+            np.minimum(nearest, gaps(every[picks[k - 1]]), out=nearest)
         picks[k] = (nearest >= (1.0 - tie) * nearest.max()).argmax()  # the first of the largest
-    return picks
+    return torch.from_numpy(picks).to(points.device)
 
 
 def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:

@@ -123,10 +123,8 @@ def _keep(known: np.ndarray) -> np.ndarray:
 
 
 def _refine(values: np.ndarray) -> np.ndarray:
-    """Return the values interpolated to a grid twice as fine: cubic in the distance, sign of the previous node.
-
-    Far from an open mesh the sign jumps, where a cubic of signed distances would be wrong.
-    """
+    """Return the values interpolated to a grid twice as fine: cubic in the distance, sign of the previous node."""
+    # Far from an open mesh the sign jumps, where a cubic of signed distances would be wrong.
     sign, distance = values < 0, np.abs(values)
     for axis in range(3):
         sign, distance = _upsample(sign, axis), _upsample(distance, axis)
@@ -187,13 +185,12 @@ class _Surface:
 
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
-    """Return the pseudonormals (f, 7, 3) of each triangle's face, sides and corners (Baerentzen and Aanaes, 2005).
+    """Return the pseudonormals (f, 7, 3) of each triangle's face, sides and corners (Baerentzen and Aanaes, 2005)."""
+    from trimesh.grouping import unique_rows
 
-    A side has the sum of the normals of its two faces, a corner that of all its faces, weighted by angle.
-    """
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.linalg.norm(face, axis=1, keepdims=True)
-    ids = _alike(np.round(corners.reshape(-1, 3), 9)).reshape(-1, 3)
+    ids = unique_rows(corners.reshape(-1, 3), digits=9)[1].reshape(-1, 3)
     ahead, back = np.roll(corners, -1, 1) - corners, np.roll(corners, 1, 1) - corners
     cosine = (ahead * back).sum(-1) / (np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1))
     weighted = face[:, None] * np.arccos(np.clip(cosine, -1, 1))[..., None]
@@ -202,15 +199,6 @@ def _pseudonormals(corners: np.ndarray) -> np.ndarray:
     side = np.unique(side[..., 0] * (ids.max() + 1) + side[..., 1], return_inverse=True)[1].reshape(-1, 3)
     at_side = _sum_by(side.reshape(-1), np.repeat(face, 3, 0))
     return np.concatenate([face[:, None], at_side[side], at_corner[ids]], 1)
-
-
-def _alike(points: np.ndarray) -> np.ndarray:
-    """Return an integer for each point (n, 3), the same for equal points."""
-    order = np.lexsort(points.T)
-    new = (points[order[1:]] != points[order[:-1]]).any(1)
-    number = np.empty(len(points), dtype=np.int64)
-    number[order] = np.concatenate([[0], np.cumsum(new)])
-    return number
 
 
 def _sum_by(number: np.ndarray, vectors: np.ndarray) -> np.ndarray:

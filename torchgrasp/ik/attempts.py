@@ -15,13 +15,7 @@ from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
-from torchgrasp.ik.candidates import (
-    PAPER_TOLERANCE,
-    TIP_PENETRATION,
-    GraspCandidates,
-    GraspProblem,
-    check_candidates,
-)
+from torchgrasp.ik.candidates import PAPER_TOLERANCE, TIP_PENETRATION, GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import lexical_order, rank_in_group

@@ -6,11 +6,4 @@ from torchgrasp.plan.forces import least_friction_forces
 from torchgrasp.plan.problem import Shape
 from torchgrasp.plan.solve import plan_contacts
 
-__all__ = [
-    "ClosureProbability",
-    "Shape",
-    "certify",
-    "closure_probability",
-    "least_friction_forces",
-    "plan_contacts",
-]
+__all__ = ["ClosureProbability", "Shape", "certify", "closure_probability", "least_friction_forces", "plan_contacts"]

@@ -71,9 +71,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     return Certificate(*(t.to(device) for t in (margin, ratio, residual, closed, witness)))
 
 
-def _prove(
-    wrench: Float[Tensor, "b m 6"],
-) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
+def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
     """Return margin, residual and witness of each wrench matrix; HiGHS decides what the simplex method leaves open."""
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.base import in_chunks
 from torchgrasp.geometry.frames import degenerate, subsets
 from torchgrasp.geometry.linalg import unit
 
@@ -114,9 +115,7 @@ def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m
     Args:
         wrench: the primitive wrenches, float64.
     """
-    parts = [_solve(w) for w in wrench.split(GRASPS_PER_CHUNK)]
-    phi, witness = (torch.cat(part) for part in zip(*parts, strict=True))
-    return phi, witness
+    return in_chunks(_solve, wrench, GRASPS_PER_CHUNK)  # pyright: ignore[reportReturnType]
 
 
 def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:

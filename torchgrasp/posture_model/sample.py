@@ -18,7 +18,7 @@ from torch import Tensor
 from torchgrasp.base import Batch, Value
 from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.linalg import fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import across, fibonacci_sphere, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
 from torchgrasp.specs import ContactSpec
@@ -40,9 +40,7 @@ def roll_contacts(
     cone, radius = hand.tips.cone.to(axes), hand.tips.radius.to(axes)
     share, turn = torch.from_numpy(generator.random((2, len(joints), 3))).to(axes)
     angle = ROLL * torch.sqrt(-2 * torch.log1p(-share * -torch.expm1(-0.5 * (cone / ROLL) ** 2)))  # Rayleigh's law
-    beside = torch.zeros_like(axes).scatter(-1, axes.abs().argmin(-1, keepdim=True), 1.0)
-    first = unit(torch.linalg.cross(axes, beside))
-    second, turn = torch.linalg.cross(axes, first), 2 * math.pi * turn[..., None]
+    (first, second), turn = across(axes), 2 * math.pi * turn[..., None]
     tilt = torch.cos(turn) * first + torch.sin(turn) * second
     normals = torch.cos(angle)[..., None] * axes + torch.sin(angle)[..., None] * tilt
     return points + radius[:, None] * (normals - axes), normals

@@ -8,7 +8,7 @@ import math
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
@@ -32,14 +32,11 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
 
 
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
-    """Raise `IndefiniteCovariance` if observations are farther apart than the kernel allows and K is indefinite.
-
-    Large noise on some observations can hide an indefinite K, so K is factored again with the least noise.
-    """
+    """Raise `IndefiniteCovariance` if observations are farther apart than the kernel allows and K is indefinite."""
     kernel = posterior.kernel
     if longest_distance(posterior.x) > kernel.diameter:
         matrix = gram(kernel, posterior.x, posterior.n_oriented)
-        matrix.diagonal().add_(least_noise**2)
+        matrix.diagonal().add_(least_noise**2)  # greater noise of some observations can hide an indefinite K
         cholesky(matrix, "the covariance K", kernel.remedy)
 
 
@@ -54,9 +51,7 @@ def append_observations(
     """Return the posterior given `new` observations besides the old: equal to conditioning on all at once.
 
     The factor L grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
-
-    `shared` holds correlated errors of the new distances: standard deviations, one column for each independent cause.
-    They add shared shared^T to the noise.
+    `shared` are correlated errors of the new distances, one column for each independent cause.
     """
     kernel = posterior.kernel
     if shared is not None:
@@ -94,16 +89,9 @@ def select_points(
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Pick the candidate points to observe, each the most informative given those picked before.
+    """Pick the candidates to observe, each the most informative given those picked before; all have normals.
 
-    Each pick appends four rows to the factor (pivoted Cholesky), which becomes the posterior's factor.
-
-    Args:
-        candidates: points on the surface, all with normals.
-        known: observations that are already made, such as points inside and outside.
-        criterion: the measure of information: posterior variance ("variance"), |mean distance| ("error"), or |mean
-            distance| + 2 sqrt(variance) ("both").
-        stop: the selection ends when no candidate has a greater variance.
+    Each pick appends four rows to the factor (pivoted Cholesky). The selection ends when no variance exceeds `stop`.
     """
     x, start = candidates.x, posterior_given(known, kernel)
     n, budget = len(x), min(budget, len(x))
@@ -164,31 +152,21 @@ def _extend(
     whitened: Float[Tensor, "rows"],
     new_order: Int[Tensor, "fresh"] | None = None,
 ) -> Posterior:
-    """Return the posterior given `new` observations too, from the grown Cholesky factor.
+    """Return the posterior given `new` observations too, points with normals first; `whitened` is L^-1 y.
 
-    In `new` points with normals are first. `whitened` is L^-1 y. `new_order` gives the row of `Observations.rows` for
-    each new row of the factor; None: the same.
+    `new_order` gives the row of `Observations.rows` for each new row of the grown factor L; None: the same.
     """
-    old, total = len(posterior.factor), len(factor)
+    n, has = len(posterior.x), torch.cat([posterior.has_normal, new.has_normal])
+    points = torch.argsort(~has, stable=True)
+    place, near = torch.argsort(points), int(has.sum())
+    # Rows of the old and of the new observations after joining: distances of all points, then normals by component
+    row = [
+        torch.cat([at] + [len(has) + c * near + at[mine] for c in range(3)])
+        for at, mine in ((place[:n], posterior.has_normal), (place[n:], new.has_normal))
+    ]
+    order = torch.cat([posterior.ordered(row[0]), row[1] if new_order is None else row[1][new_order]])
     solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
-    line = torch.arange(total, device=factor.device)
-    later = line[old:] if new_order is None else old + new_order
-    order = _row_of_each(posterior.has_normal, new.has_normal)[torch.cat([posterior.ordered(line[:old]), later])]
     weights = torch.empty_like(solved)
     weights[order] = solved
-    has = torch.cat([posterior.has_normal, new.has_normal])
-    points = torch.argsort(~has, stable=True)
     x = torch.cat([posterior.x, new.x])[points]
     return Posterior(x, has[points], weights, factor, order, posterior.kernel)
-
-
-def _row_of_each(old: Bool[Tensor, "n"], new: Bool[Tensor, "m"]) -> Int[Tensor, "rows"]:
-    """Return the row of each old and each new observation after joining: points with normals come first."""
-    n, m, near, fresh = len(old), len(new), int(old.sum()), int(new.sum())
-    total, oriented = n + m, near + fresh
-    line = torch.arange(total, device=old.device)
-    moved = torch.cat([line[:near], oriented + line[: n - near]])  # of old points: those with normals stay first
-    added = torch.cat([near + line[:fresh], oriented + (n - near) + line[: m - fresh]])
-    before = [moved] + [total + c * oriented + line[:near] for c in range(3)]
-    after = [added] + [total + c * oriented + near + line[:fresh] for c in range(3)]
-    return torch.cat(before + after)

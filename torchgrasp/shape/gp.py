@@ -61,24 +61,14 @@ class ShapeGP(Posterior, Normalisation):
     @classmethod
     @checked
     def of(
-        cls,
-        posterior: Posterior,
-        normalisation: Normalisation,
-        cloud: PointCloud,
-        psi: Positive,
-        std_factor: Positive = 1.0,
+        cls, posterior: Posterior, frame: Normalisation, cloud: PointCloud, psi: Positive, std_factor: Positive = 1.0
     ) -> "ShapeGP":
         """Return the shape of a posterior; its domain follows from kernel and observations."""
         # Far from all observations the posterior has no information.
         reach = 1.25 * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
-        return cls(
-            **_fields(posterior, Posterior),
-            **_fields(normalisation, Normalisation),
-            psi=psi,
-            domain_radius=min(posterior.kernel.diameter / 2.0, reach),
-            std_factor=std_factor,
-            cloud=cloud,
-        )
+        radius = min(posterior.kernel.diameter / 2.0, reach)
+        fields = common_fields(posterior, Posterior) | common_fields(frame, Normalisation)
+        return cls(**fields, psi=psi, domain_radius=radius, std_factor=std_factor, cloud=cloud)
 
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
         """Return the shape on another device, always in float64, which its condition number requires."""
@@ -222,7 +212,7 @@ class ShapeGP(Posterior, Normalisation):
     @checked
     def append(self, new: Observations) -> "ShapeGP":
         """Return the shape given further normalised observations; kernel and domain do not change."""
-        return dataclasses.replace(self, **_fields(append_observations(self, new), Posterior))
+        return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 
     @checked
     def moved(self, b_from_a: Pose) -> "ShapeGP":
@@ -230,7 +220,6 @@ class ShapeGP(Posterior, Normalisation):
         rotation, n = b_from_a[:3, :3].to(self.x), len(self.x)
 
         def turn(rows: Float[Tensor, "rows c"]) -> Float[Tensor, "rows c"]:
-            """Rotate the rows of normals."""
             normals = rows[n:].reshape(3, self.n_oriented * rows.shape[1])
             return torch.cat([rows[:n], (rotation @ normals).reshape(rows[n:].shape)])
 
@@ -254,12 +243,10 @@ class ShapeGP(Posterior, Normalisation):
         outside = radius > self.domain_radius
         if bool(outside.any()):
             first = int(torch.nonzero(outside)[0])
-            raise BadArgument(
-                "points",
-                f"{int(outside.sum())} of {len(flat)} points outside the domain, the first {flat[first].tolist()} m, "
-                f"{float(radius[first]) * self.scale:.4g} m from the centre",
-                f"points within {self.domain_radius * self.scale:.4g} m of {self.center.tolist()} m",
-            )
+            found = f"{int(outside.sum())} of {len(flat)} points outside the domain, the first {flat[first].tolist()} m"
+            away = f"{float(radius[first]) * self.scale:.4g} m from the centre"
+            allowed = f"points within {self.domain_radius * self.scale:.4g} m of {self.center.tolist()} m"
+            raise BadArgument("points", f"{found}, {away}", allowed)
         return x
 
 
@@ -268,6 +255,6 @@ def _reshape(rows: Float[Tensor, "q *c"], points: Float[Tensor, "*b 3"]) -> Tens
     return rows.to(points).reshape(points.shape[:-1] + rows.shape[1:])
 
 
-def _fields(value: Value, kind: type[Value]) -> dict[str, Any]:
+def common_fields(value: Value, kind: type[Value]) -> dict[str, Any]:
     """Return those fields of a value that the class `kind` also has."""
     return {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]

@@ -3,19 +3,19 @@
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, join
+from torchgrasp.base import Value, join, map_tensors
 from torchgrasp.checks import Pose, checked
 from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere
 from torchgrasp.shape.completion.complete import LEAST_NOISE, correlated_errors
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.vessel import FORM_ERROR, RIM, HiddenWall, Vessel, Wall, complete_walls, lid
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import ShapeGP, common_fields
 from torchgrasp.shape.support import (
     HIDDEN_NORMAL_NOISE,
     NORMAL_NOISE,
@@ -31,6 +31,8 @@ from torchgrasp.shape.support import (
 )
 from torchgrasp.shape.values import JointEstimate, MeanJet, Normalisation, Observations, SurfaceJet, off_surface
 from torchgrasp.values import PointCloud
+
+Found = TypeVar("Found")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,14 +61,13 @@ class HollowShape(ShapeGP):
     @checked
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
         """Return the vessel with two surfaces in the same normalised frame; `cloud` holds the seen points of both."""
-        fields = {f.name: getattr(outer, f.name) for f in dataclasses.fields(ShapeGP)}
-        fields |= {"cloud": cloud, "domain_radius": min(outer.domain_radius, inner.domain_radius)}
-        return cls(**fields, inner=inner)
+        radius = min(outer.domain_radius, inner.domain_radius)
+        return cls(**common_fields(outer, ShapeGP) | {"cloud": cloud, "domain_radius": radius}, inner=inner)
 
     @cached_property
     def outer(self) -> ShapeGP:
         """The outer surface alone, as if the vessel were solid."""
-        return ShapeGP(**{f.name: getattr(self, f.name) for f in dataclasses.fields(ShapeGP)})
+        return ShapeGP(**common_fields(self, ShapeGP))
 
     @property
     def walls(self) -> tuple[ShapeGP, ...]:
@@ -93,17 +94,20 @@ class HollowShape(ShapeGP):
     @checked
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
         """Return mean and covariance of distance and gradient (d, w) at normalised points."""
-        return self._by_wall(x, lambda wall, own: wall.estimate(own))  # pyright: ignore[reportReturnType]
+        parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
+        return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
 
     @checked
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance of the distance with derivatives, at normalised points."""
-        return SurfaceJet(*self._by_wall(x, lambda wall, own: _fields(wall.jet(own))))
+        parts, merge = self._by_wall(x, lambda wall, own: wall.jet(own))
+        return map_tensors(merge, *parts)
 
     @checked
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean distance with derivatives, at normalised points."""
-        return MeanJet(*self._by_wall(x, lambda wall, own: _fields(wall.mean_jet(own))))
+        parts, merge = self._by_wall(x, lambda wall, own: wall.mean_jet(own))
+        return map_tensors(merge, *parts)
 
     @checked
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
@@ -128,33 +132,17 @@ class HollowShape(ShapeGP):
         return self.join(outer, self.inner.moved(b_from_a), outer.cloud)
 
     def _by_wall(
-        self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], tuple[Any, ...]]
-    ) -> tuple[Tensor, ...]:
-        """Evaluate each wall of the vessel at the points where it is the surface, and merge the results."""
-        owner = self.wall_at(x)
-        found: tuple[Tensor, ...] = ()
-        for wall, own in zip(self.walls, owner.T, strict=True):
-            part = evaluate(wall, x[own])
-            found = found or tuple(p.new_empty(len(x), *p.shape[1:]) for p in part)
-            for whole, rows in zip(found, part, strict=True):
-                whole[own] = rows
-        return found
-
-
-def _fields(jet: MeanJet) -> tuple[Tensor, ...]:
-    """Return the values of a jet's fields, in order."""
-    return tuple(getattr(jet, f.name) for f in dataclasses.fields(jet))
+        self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], Found]
+    ) -> tuple[list[Found], Callable[..., Tensor]]:
+        """Evaluate each wall at the points where it is the surface; also return the function that merges the rows."""
+        rows = [torch.nonzero(own)[:, 0] for own in self.wall_at(x).T]
+        back = torch.argsort(torch.cat(rows))
+        return [evaluate(w, x[own]) for w, own in zip(self.walls, rows, strict=True)], lambda *y: torch.cat(y)[back]
 
 
 @dataclasses.dataclass(frozen=True)
 class Middle(Value):
-    """Points in the middle of a vessel's wall, normalised, and the wall's thickness.
-
-    Args:
-        x: the points.
-        side: mask of the points where the wall is exactly as thick as `thickness`; elsewhere it is at least as thick.
-        thickness: thickness of the wall, normalised.
-    """
+    """Points in the middle of a vessel's wall and its thickness, normalised; the wall is thicker unless `side`."""
 
     x: Float[Tensor, "n 3"]
     side: Bool[Tensor, "n"]
@@ -166,14 +154,7 @@ def vessel_supports(
 ) -> tuple[Support, Support, Middle]:
     """Return observations of a vessel's outer and inner surface besides the seen points, and points amid the wall.
 
-    Signed distances are negative in the material. So distances of the inner surface are positive around the axis.
-
-    Args:
-        cloud: the view [m] with normals, in float64.
-        vessel: the vessel found in the view.
-        outline: outline of each view.
-        table: the table's height [m].
-        noise: standard deviation of an anchor's distance, normalised.
+    `noise` is that of an anchor's distance, normalised. Distances of the inner surface are positive around the axis.
     """
     device, cloud = cloud.points.device, cloud.to("cpu")
     frame = frame_around(cloud.points)
@@ -202,10 +183,8 @@ def vessel_supports(
 
     def support(anchors: Observations, parts: list[Part], free: Any, rows: Tensor) -> Support:
         on_device = tuple((part.to(device), None if errors is None else errors.to(device)) for part, errors in parts)
-        factor = STD_FACTORS["vessel", True]
-        return Support(
-            frame.to(device), anchors.to(device), NORMAL_NOISE, factor, on_device, free, rows.to(device), "vessel"
-        )
+        placed, factor = (frame.to(device), anchors.to(device), NORMAL_NOISE), STD_FACTORS["vessel", True]
+        return Support(*placed, factor, on_device, free, rows.to(device), "vessel")
 
     free = free_space(outline, frame.to(device), table)
     return (
@@ -218,8 +197,8 @@ def vessel_supports(
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
     """Return the vessel after adding observations that give its wall the known thickness.
 
-    Two independent surfaces might touch, which tears holes into the wall. In the middle of the wall the two distances
-    must add up to minus the thickness. Elsewhere the more certain surface gives an observation of the other.
+    Two independent surfaces might touch, which tears holes into the wall. In its middle the two distances must add up
+    to minus the thickness; otherwise the more certain surface gives an observation of the other.
     """
     x, thickness, noise = middle.x, middle.thickness, 0.0007 / shape.scale
     for _ in range(3):
@@ -233,12 +212,11 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
         rows = rows[farthest_points(x[rows], 24, tie=TIE)]
         variance = torch.stack([wall.estimate(x[rows])[1][:, 0, 0] for wall in shape.walls])
         walls = []
-        for number, wall in enumerate(shape.walls):
-            own, other = variance[number], variance[1 - number]
-            known = off_surface(x[rows], -thickness - distance[1 - number, rows], noise)
+        for wall, own, other, beyond in zip(shape.walls, variance, variance.flip(0), distance.flip(0), strict=True):
+            known = off_surface(x[rows], -thickness - beyond[rows], noise)
             spread = torch.sqrt(shape.std_factor**2 * other + noise**2)
             known = dataclasses.replace(known, distance_noise=spread)[own >= other]
-            walls.append(wall.append(known) if len(known.x) else wall)
+            walls.append(wall.append(known) if len(known) else wall)
         shape = HollowShape.join(walls[0], walls[1], shape.cloud)
     return shape
 

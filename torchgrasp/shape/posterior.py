@@ -67,34 +67,38 @@ class Posterior(Value):
     def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
         """Return the mean signed distance at normalised points."""
 
-        def evaluate(x: Tensor) -> tuple[Tensor]:
-            a, b = self._split_weights()
-            k, first = self.kernel.derivatives(_distances(x, self.x), 2)
-            along = x @ b.T - (self.x[: len(b)] * b).sum(-1)
-            return (k @ a - (first[:, : len(b)] * along).sum(1),)
+        def evaluate(x: Tensor) -> tuple[Tensor, ...]:
+            return in_chunks(lambda part: self._evaluate_mean(part, gradient=False), x, 2048)
 
-        return pass_gradients(x, lambda x: in_chunks(evaluate, x, 2048), lambda x: (self.mean_and_gradient(x)[1],))[0]
+        return pass_gradients(x, evaluate, lambda x: (self.mean_and_gradient(x)[1],))[0]
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
         """Return the mean signed distance and its gradient at normalised points; see `jet`."""
 
-        def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
-            a, b = self._split_weights()
-            k, first, second = self.kernel.derivatives(_distances(x, self.x), 3)
-            along = x @ b.T - (self.x[: len(b)] * b).sum(-1)
-            near = first[:, : len(b)]
-            distance = k @ a - (near * along).sum(1)
-            c = first * a
-            c[:, : len(b)].addcmul_(second[:, : len(b)], along, value=-1.0)
-            return distance, _sum_differences(c, x, self.x) - near @ b
+        def evaluate(x: Tensor) -> tuple[Tensor, ...]:
+            size = 512 if x.device.type == "cpu" else 16384
+            return in_chunks(lambda part: self._evaluate_mean(part, gradient=True), x, size)
 
         def differentiate(x: Tensor) -> tuple[Tensor, Tensor]:
             jet = self.mean_jet(x)
             return jet.gradient, jet.hessian
 
-        size = 512 if x.device.type == "cpu" else 16384
-        return pass_gradients(x, lambda x: in_chunks(evaluate, x, size), differentiate)  # pyright: ignore[reportReturnType]
+        return pass_gradients(x, evaluate, differentiate)  # pyright: ignore[reportReturnType]
+
+    def _evaluate_mean(self, x: Float[Tensor, "q 3"], gradient: bool) -> tuple[Tensor, ...]:
+        """Return the mean distance and, if asked for, its gradient for one chunk of points."""
+        a, b = self._split_weights()
+        near = len(b)  # the points with normals come first
+        distances = torch.cdist(x, self.x, compute_mode="donot_use_mm_for_euclid_dist")
+        k, first, *second = self.kernel.derivatives(distances, 3 if gradient else 2)
+        along = x @ b.T - (self.x[:near] * b).sum(-1)
+        distance = k @ a - (first[:, :near] * along).sum(1)
+        if not gradient:
+            return (distance,)
+        c = first * a
+        c[:, :near].addcmul_(second[0][:, :near], along, value=-1.0)
+        return distance, _sum_differences(c, x, self.x) - first[:, :near] @ b
 
     @checked
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
@@ -232,11 +236,6 @@ def _sum_differences(c: Float[Tensor, "q n"], x: Float[Tensor, "q 3"], y: Float[
     return x * c.sum(1, keepdim=True) - c @ y
 
 
-def _distances(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> Float[Tensor, "q n"]:
-    """Return the distances between all pairs of points, without cancellation."""
-    return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
-
-
 def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
     """Return the covariance (k, k) of the signed distances within each set of k normalised points, Eq. (8)."""
     return combined_covariance(posterior, x[:, :, None], x.new_ones(1, 1, 1, 1))
@@ -259,9 +258,8 @@ def combined_covariance(
 def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, fix: str) -> Float[Tensor, "*b k k"]:
     """Return the symmetric square root of covariance matrices, unique even with equal eigenvalues.
 
-    Coinciding points give eigenvalues of zero, which rounding makes slightly negative: such eigenvalues count as zero.
-    Larger negative eigenvalues, relative to the `prior` variance, raise `IndefiniteCovariance`, whose message ends with
-    `fix`.
+    Eigenvalues of zero, as of coinciding points, may be negative by rounding. Larger ones, relative to the `prior`
+    variance, raise `IndefiniteCovariance`, whose message ends with `fix`.
     """
     values, vectors = torch.linalg.eigh(covariance)
     if values.numel() and not float(values.min()) >= -1e-8 * prior:

@@ -24,20 +24,11 @@ FREE_NOISE = 0.003  # standard deviation [m] of a distance observed in free spac
 OUTLINE_ERROR = 0.005  # the object may reach this far [m] beyond its outline: a camera loses rims
 MAX_RADIUS = 1.15  # radius, normalised, within which free space is probed: inside the sphere of the points outside
 STD_FACTORS: dict[tuple[Kind, bool], float] = {
-    ("ball", True): 0.5,
-    ("revolution", True): 0.56,
-    ("mirrored", True): 0.59,
-    ("ball", False): 0.56,
-    ("revolution", False): 0.59,
-    ("mirrored", False): 0.75,
-    ("guess", True): 1.0,
-    ("guess", False): 1.0,
-    ("cut off", True): 2.0,
-    ("cut off", False): 2.0,
-    ("vessel", True): 0.58,
-    ("whole", True): 0.5,
-    ("whole", False): 0.5,
-}
+    ("ball", True): 0.5, ("revolution", True): 0.56, ("mirrored", True): 0.59, ("vessel", True): 0.58,
+    ("ball", False): 0.56, ("revolution", False): 0.59, ("mirrored", False): 0.75,
+    ("guess", True): 1.0, ("cut off", True): 2.0, ("whole", True): 0.5,
+    ("guess", False): 1.0, ("cut off", False): 2.0, ("whole", False): 0.5,
+}  # fmt: skip
 """Real deviations over the posterior's, by the kind of the hidden side and whether the table is known.
 
 `scripts/train.py bands DIR` fits them."""
@@ -91,13 +82,9 @@ def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
 
 
 def camera_support(seen: PreparedCloud, completion: Completion | None, noise: float, table: float | None) -> Support:
-    """Return supporting observations at metric distances; of a view also outline, hidden side and free space.
+    """Return supporting observations at metric distances; of a view (`completion`) also its hidden side and free space.
 
-    Args:
-        seen: the cloud.
-        completion: the completed hidden side; None: all sides were seen.
-        noise: standard deviation of the distance observed inside, normalised.
-        table: the table's height [m]; None: unknown.
+    `noise` is that of the distance observed inside, normalised; `table` is the table's height [m].
     """
     hidden = seen.points[:0] if completion is None else completion.points.to(seen.points)
     surface = torch.cat([seen.points, hidden])
@@ -141,8 +128,8 @@ def free_space(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Return points in free space and lower bounds of their signed distance, both normalised.
 
-    The points lie beside the object's outline, and below the table of height `table` [m]. A bound becomes an
-    observation only where the shape violates it: otherwise the shape would inflate to its visual hull.
+    The points lie beside the object's outline, and below the table. A bound becomes an observation only where the shape
+    violates it: otherwise the shape would inflate to its visual hull.
     """
     origin, scale = frame.center.double().cpu(), frame.scale
     points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])

@@ -138,9 +138,10 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
 def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     """Return the mean distance on a grid from -radius along each axis; NaN outside the ball.
 
-    Only blocks of cells that the zero level may cross are refined. Other nodes copy a neighbour's value, of which only
-    the sign is used.
+    Only blocks of cells that the zero level may cross are refined; other nodes have the sign of a neighbour.
     """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
     line = -radius + step * torch.arange(cells + 1, dtype=torch.float64, device=shape.x.device)
 
     def mean(stride: int, nodes: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -151,11 +152,11 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     values = mean(stride, tuple(np.indices((count, count, count)).reshape(3, -1))).reshape((count,) * 3)
     steepest = STEEPER * max(float(np.abs(np.diff(values, axis=axis)).max()) for axis in range(3)) / (stride * step)
     while stride > 1:
-        least = _least_corner(np.abs(values))
-        near = np.repeat(np.repeat(np.repeat(least < steepest * math.sqrt(0.75) * stride * step, 2, 0), 2, 1), 2, 2)
+        least = minimum_filter(np.abs(values), 2, origin=-1)[:-1, :-1, :-1]  # over the corners of each cell
+        near = (least < steepest * math.sqrt(0.75) * stride * step).repeat(2, 0).repeat(2, 1).repeat(2, 2)
         stride //= 2
-        values = np.repeat(np.repeat(np.repeat(values, 2, 0), 2, 1), 2, 2)[:-1, :-1, :-1]
-        wanted = np.nonzero(_touched(near))
+        values = values.repeat(2, 0).repeat(2, 1).repeat(2, 2)[:-1, :-1, :-1]
+        wanted = np.nonzero(maximum_filter(np.pad(near, ((0, 1),) * 3), 2))  # the corners of those cells
         values[wanted] = mean(stride, wanted)
     squares = (line * line).cpu().numpy()
     distance = squares[:, None, None] + squares[:, None] + squares
@@ -163,28 +164,8 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     return values
 
 
-def _least_corner(values: np.ndarray) -> np.ndarray:
-    """Return the least value over the corners of each grid cell."""
-    for axis in range(3):
-        along = np.moveaxis(values, axis, 0)
-        values = np.moveaxis(np.minimum(along[1:], along[:-1]), 0, axis)
-    return values
-
-
-def _touched(cells: np.ndarray) -> np.ndarray:
-    """Return which grid nodes are corners of the given cells."""
-    nodes = np.pad(cells, 1)
-    for axis in range(3):
-        along = np.moveaxis(nodes, axis, 0)
-        nodes = np.moveaxis(along[1:] | along[:-1], 0, axis)
-    return nodes
-
-
 def newton_step(
-    value: Float[Tensor, "n"],
-    gradient: Float[Tensor, "n 3"],
-    direction: Float[Tensor, "n 3"],
-    least_slope: float = 0.0,
+    value: Float[Tensor, "n"], gradient: Float[Tensor, "n 3"], direction: Float[Tensor, "n 3"], least_slope: float = 0.0
 ) -> Float[Tensor, "n"]:
     """Return the Newton step to the zero level, as a multiple of `direction`; slopes are at least `least_slope`."""
     return -value / (gradient * direction).sum(-1).clamp_min(least_slope)

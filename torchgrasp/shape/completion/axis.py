@@ -6,13 +6,15 @@ The lines along the normals of a surface of revolution meet its axis: they lie i
 
 import dataclasses
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
-from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, solve_least_squares, unit
+from torchgrasp.geometry.linalg import across, farthest_points, fibonacci_sphere, solve_least_squares, unit
 from torchgrasp.geometry.plane import LEAST_TILT
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import PROBES, SymmetryScorer
@@ -37,38 +39,39 @@ class Revolution:
 
 
 def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution] | None:
-    """Return the frame of an axis of revolution, and the body about its z axis; None: there is no axis.
+    """Return the frame `axis_from_cloud` of an axis of revolution, and the body about its z axis; None: no axis.
 
-    The frame is `axis_from_cloud`; its x axis points towards the cameras. The axis is fitted to the scorer's probe
-    points. The body, rotated about the axis, must stay out of free space and above the table.
+    The axis is fitted to the scorer's probes. The body, rotated about it, must stay out of free space and the table.
     """
-    center, direction, cost = _fit_axis(scorer.probes, scorer.probe_normals)
+    center, direction, cost = _fit_axis(*scorer.probes)
     if not cost < MAX_COST:
         return None
     axis_from_cloud = _frame(center, direction, scorer.outline)
     points = apply(axis_from_cloud, scorer.points)
     lines = _lines_from_above(points, rotate(axis_from_cloud, scorer.normals))
     origin = torch.zeros(2, dtype=torch.float64)
-    body = _split_body(points, lines, origin)
-    allowed = torch.hypot(ROUNDNESS * body.typical, torch.full_like(body.typical, ROUND_ERROR))
-    rms = (body.miss / allowed)[body.side].square().mean().sqrt()
-    if not body.is_round(rms < 1.0):
+    mask = _round_body(
+        points,
+        lines,
+        origin,
+        lambda _, typical: torch.hypot(ROUNDNESS * typical, torch.full_like(typical, ROUND_ERROR)),
+    )
+    if mask is None:
         return None
-    spread = farthest_points(points[body.mask], PROBES, tie=TIE)
-    turned = apply(inverse(axis_from_cloud), _turn(points[body.mask][spread]))
+    spread = points[mask][farthest_points(points[mask], PROBES, tie=TIE)]
+    turned = apply(inverse(axis_from_cloud), (spread @ rotations_about_z(12).mT).flatten(0, 1))
     excluded = scorer.outline.violation(turned) > 0.003
     if scorer.table is not None:
         excluded |= scorer.table.height(turned) < -0.003
-    return (axis_from_cloud, Revolution(origin, body.mask)) if excluded.double().mean() < MAX_FREE else None
+    return (axis_from_cloud, Revolution(origin, mask)) if excluded.double().mean() < MAX_FREE else None
 
 
 def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Revolution | None:
     """Return the upright body of revolution to which most points belong; None: there is none."""
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
-    body = _split_body(points, lines, center)
-    spread = (body.miss / body.radius.clamp_min(LEAST_RADIUS))[body.side].square().mean().sqrt()
-    return Revolution(center, body.mask) if body.is_round(spread < MAX_SPREAD) else None
+    mask = _round_body(points, lines, center, lambda radius, _: MAX_SPREAD * radius.clamp_min(LEAST_RADIUS))
+    return None if mask is None else Revolution(center, mask)
 
 
 def fit_axis(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "2"]:
@@ -76,11 +79,10 @@ def fit_axis(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Flo
     return _fit_to_lines(points, _lines_from_above(points, normals))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Lines:
-    """Lines along normals, seen from above: the points x with across . x = offset.
+class _Lines(NamedTuple):
+    """Lines along normals, seen from above: points x with across . x = offset; `slope`, `level`: length and direction.
 
-    `slope` is the length of a normal's horizontal part, `level` its unit direction, `steep` whether it is long enough.
+    `steep` says whether the horizontal part of a normal is long enough.
     """
 
     slope: Float[Tensor, "n"]
@@ -109,28 +111,14 @@ def _fit_to_lines(points: Float[Tensor, "n 3"], lines: _Lines) -> Float[Tensor, 
     return center
 
 
-@dataclasses.dataclass(frozen=True)
-class _Body:
-    """The part of a cloud that is a body about a vertical axis: `mask` of all its points, `side` of those on its side.
+def _round_body(
+    points: Float[Tensor, "n 3"], lines: _Lines, center: Float[Tensor, "2"], allowed: Callable[[Tensor, Tensor], Tensor]
+) -> Bool[Tensor, "n"] | None:
+    """Return the mask of a body about a vertical axis; None if it is not round, a small part, or one flat side.
 
-    For each point: `miss` [m] of its normal's line from the axis, its `radius`, and the `typical` radius at its height.
-    `one_way` is the length of the side's mean horizontal normal.
+    The normals of a body meet the axis, and its radius is typical of the height. `allowed` returns the RMS [m] by which
+    normals may miss the axis, given the radius of each point and the typical radius at its height.
     """
-
-    mask: Bool[Tensor, "n"]
-    side: Bool[Tensor, "n"]
-    miss: Float[Tensor, "n"]
-    radius: Float[Tensor, "n"]
-    typical: Float[Tensor, "n"]
-    one_way: Float[Tensor, ""]
-
-    def is_round(self, fits: Bool[Tensor, ""]) -> bool:
-        """Return whether the body is most of the cloud, fits a surface of revolution, and is not a flat side."""
-        return bool((self.mask.double().mean() > BODY_SHARE) & fits & (self.one_way < 0.95))
-
-
-def _split_body(points: Float[Tensor, "n 3"], lines: _Lines, center: Float[Tensor, "2"]) -> _Body:
-    """Return the body about a vertical axis: points whose normals meet the axis and whose radius fits their height."""
     miss = lines.offset - lines.across @ center
     radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
     meets = lines.steep & (miss.abs() / radius.clamp_min(LEAST_RADIUS) < MISS)
@@ -139,26 +127,25 @@ def _split_body(points: Float[Tensor, "n 3"], lines: _Lines, center: Float[Tenso
     typical = torch.where(slices, radius, torch.nan).nanmedian(1).values
     mask = torch.where(lines.steep, meets & ((radius - typical).abs() < near), radius < typical + near)
     side = mask & lines.steep
-    return _Body(mask, side, miss, radius, typical, torch.linalg.vector_norm(lines.level[side].mean(0)))
+    spread = (miss / allowed(radius, typical))[side].square().mean().sqrt()
+    one_way = torch.linalg.vector_norm(lines.level[side].mean(0))
+    return mask if bool((mask.double().mean() > BODY_SHARE) & (spread < 1.0) & (one_way < 0.95)) else None
 
 
 def _fit_axis(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], float]:
-    """Return a point [m] of the axis that most lines along the normals meet, the axis direction, and the cost.
-
-    Gauss-Newton steps with robust weights (Cauchy) from several directions at once; each step narrows the weights.
-    """
-    starts = 12
+    """Return a point [m] of the axis that most lines along the normals meet, the axis direction, and the cost."""
+    starts = 12  # Gauss-Newton steps with robust weights (Cauchy) from so many directions; each narrows the weights
     direction = fibonacci_sphere(2 * starts)[:starts]
     center, cost = points.mean(0).expand_as(direction), torch.zeros(starts, dtype=torch.float64)
     for step in range(12):
-        across = torch.stack(_across(direction), 1)
+        axes = torch.stack(across(direction), 1)
         arm = points - center[:, None]
         moment = torch.linalg.cross(arm, normals.expand_as(arm))
         miss = (moment * direction[:, None]).sum(-1)
         lever = torch.linalg.cross(direction[:, None].expand_as(arm), normals.expand_as(arm))
-        slope = torch.cat([lever @ across.mT, moment @ across.mT], 2)
+        slope = torch.cat([lever @ axes.mT, moment @ axes.mT], 2)
         scale = HALF_WEIGHT + (0.02 - HALF_WEIGHT) * 0.6**step
         weighted = slope / (1.0 + (miss / scale) ** 2)[..., None]
         system = slope.mT @ weighted
@@ -167,19 +154,12 @@ def _fit_axis(
         found = -torch.linalg.solve(system, (weighted * miss[..., None]).sum(1))
         length = torch.linalg.vector_norm(found[:, 2:], dim=1, keepdim=True)
         turn = found[:, 2:] * (0.3 / length.clamp_min(0.3))  # [rad], misses are linear in small turns only
-        center = center + (found[:, None, :2] @ across)[:, 0]
-        direction = unit(direction + (turn[:, None] @ across)[:, 0])
+        center = center + (found[:, None, :2] @ axes)[:, 0]
+        direction = unit(direction + (turn[:, None] @ axes)[:, 0])
         center = center + ((points.mean(0) - center) * direction).sum(1, keepdim=True) * direction
         cost = torch.log1p((miss / HALF_WEIGHT) ** 2).mean(1)
     best = int(cost.argmin())
     return center[best], direction[best], float(cost[best])
-
-
-def _across(direction: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
-    """Return two unit vectors perpendicular to each direction and to each other."""
-    helper = torch.zeros_like(direction).scatter(-1, direction.abs().argmin(-1, keepdim=True), 1.0)
-    first = unit(torch.linalg.cross(direction, helper))
-    return first, torch.linalg.cross(direction, first)
 
 
 def _frame(center: Float[Tensor, "3"], direction: Float[Tensor, "3"], outline: Outlines) -> Float[Tensor, "4 4"]:
@@ -187,14 +167,15 @@ def _frame(center: Float[Tensor, "3"], direction: Float[Tensor, "3"], outline: O
     eye = torch.stack([view.viewpoint for view in outline.views]).mean(0) - center
     level = eye - (eye @ direction) * direction
     length = torch.linalg.vector_norm(level)
-    x = level / length if length > LEAST_TILT * torch.linalg.vector_norm(eye) else _across(direction)[0]
+    x = level / length if length > LEAST_TILT * torch.linalg.vector_norm(eye) else across(direction)[0]
     rotation = torch.stack([x, torch.linalg.cross(direction, x), direction])
     return rigid(rotation, -rotation @ center)
 
 
-def _turn(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
-    """Return the points rotated about z by all multiples of 30 degrees."""
-    angle = 2 * math.pi / 12 * torch.arange(1, 12, dtype=torch.float64)
-    x, y, z = points.unbind(1)
-    cos, sin = angle.cos()[:, None], angle.sin()[:, None]
-    return torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(len(angle), -1)], -1).reshape(-1, 3)
+def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
+    """Return the rotations about z by k / n of a full circle, for k from 1 to n - 1."""
+    angle = torch.arange(1, n, dtype=torch.float64) * (2 * math.pi / n)
+    turn = torch.zeros(n - 1, 3, 3, dtype=torch.float64)
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
+    turn[:, 2, 2] = 1.0
+    return turn

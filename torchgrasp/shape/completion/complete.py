@@ -2,11 +2,12 @@
 
 import dataclasses
 import math
-from typing import Literal
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
@@ -15,19 +16,12 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions
 from torchgrasp.shape.completion.axis import Revolution, find_axis, find_revolution
-from torchgrasp.shape.completion.ellipsoid import Ellipsoid, find_ellipsoid
-from torchgrasp.shape.completion.silhouette import TIE, Outlines
-from torchgrasp.shape.completion.symmetry import (
-    SymmetryScorer,
-    find_plane_through_axis,
-    find_planes,
-    planes_near,
-)
+from torchgrasp.shape.completion.ellipsoid import find_ellipsoid
+from torchgrasp.shape.completion.silhouette import FRONT_MARGIN, TIE, Outlines
+from torchgrasp.shape.completion.symmetry import SymmetryScorer, find_plane_through_axis, find_planes, planes_near
 from torchgrasp.shape.posterior import symmetric_root
 from torchgrasp.values import PointCloud
 
-HULL_MARGIN, FRONT_MARGIN = 0.001, 0.002
-"""A hidden point may be this far [m] outside the hull, and in front of the visible surface or below the table."""
 NEW, SPACING = 0.006, 0.004  # least distance [m] of a hidden point from the cloud and from another hidden point
 LEAST_NOISE = 0.003  # standard deviation [m] of a mirrored point of an object that is symmetric about that very plane
 SYMMETRIC, ASYMMETRY = 0.45, 0.060
@@ -40,15 +34,13 @@ cloud's size."""
 
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
 """What a hidden side follows from: an ellipsoid, an axis, mirror planes, or nothing but the outline."""
+SomeHidden = TypeVar("SomeHidden", bound=Any)
+"""A batch with `points` [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
-    """Estimated points of the hidden side, with normals and correlated errors.
-
-    The errors along the normals have the covariance LEAST_NOISE^2 I + D D^T [m^2]; errors of nearby points do not
-    average out. The columns of D (`deviations`) are errors of the mirror planes, and a smooth field of length scale
-    `PART`, the asymmetry of the object.
+    """Estimated points of the hidden side; errors along the normals have the covariance LEAST_NOISE^2 I + D D^T [m^2].
 
     Args:
         shared: standard deviations [m] of the errors that each mirror plane causes.
@@ -78,20 +70,14 @@ class Completion(Value):
 
     @property
     def deviations(self) -> Float[Tensor, "m k"]:
-        """The correlated errors D [m], one column for each independent cause.
-
-        Errors of the mirror planes also vary locally, so they count in the smooth field too.
-        """
+        """The correlated errors D [m], one column for each independent cause."""
         return correlated_errors(self.points, self.shared, self.asymmetry)
 
 
 def correlated_errors(
     points: Float[Tensor, "m 3"], shared: Float[Tensor, "m c"], local: Float[Tensor, "m"] | float
 ) -> Float[Tensor, "m k"]:
-    """Return the error columns [m] of independent causes: the shared errors, and a smooth field of length `PART`.
-
-    The field has the combined standard deviation of the local and the shared errors.
-    """
+    """Return the error columns [m] of independent causes: the shared errors, and a smooth field of their deviation."""
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
     alike = torch.exp(-0.5 * (torch.cdist(points, points) / PART) ** 2)
     return torch.cat([shared, deviation[:, None] * symmetric_root(alike, 1.0, "keep hidden points apart")], 1)
@@ -101,11 +87,8 @@ def correlated_errors(
 def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count = 50) -> Completion:
     """Return points of the hidden side, from the cloud's symmetry, with their uncertainty.
 
-    The cloud is mirrored across its best planes and across pairs of them; images in better planes come first. A point
-    is kept if no view excludes it and no other point is near. Low scores mean a large asymmetry.
-
-    A body of revolution and a part attached to it, such as a handle, are mirrored separately, in the frame of the axis.
-    Any plane through the axis mirrors the body. The attached part alone determines its own plane.
+    The cloud is mirrored across its best planes and across pairs of them; images in better planes come first. A body of
+    revolution and a part attached to it, such as a handle, are mirrored separately, in the frame of the axis.
 
     The cloud must be clean, with outward normals and viewpoints, or `BadArgument` is raised. `table` is the height [m]
     of a table with normal z.
@@ -113,20 +96,32 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     if cloud.normals is None or cloud.viewpoint is None:
         raise BadArgument("cloud", "no normals or no viewpoint", "outward normals and viewpoints: see prepare_cloud")
     scorer = SymmetryScorer.of(cloud.to("cpu", torch.float64), table)
-    if scorer.outline.cut:  # an image's border is no outline, and half an object is not symmetric
-        return _nothing(scorer)
-    ball = find_ellipsoid(scorer.points, scorer.normals, scorer.outline, table)
+    outline, none, no_plane = scorer.outline, scorer.points[:0], scorer.points.new_zeros(0, 4)
+    if outline.cut:  # an image's border is no outline, and half an object is not symmetric
+        return Completion(none, none, none[:, :0], none[:, 0], no_plane, none[:, 0], outline, "cut off")
+    ball = find_ellipsoid(scorer.points, scorer.normals, outline, table)
     if ball is not None:
-        return _hidden_side(scorer, ball, budget)
+        rows = torch.nonzero(_hidden(scorer, ball.points))[:, 0]
+        rows = rows[farthest_points(ball.points[rows], budget, tie=TIE)]
+        points, misfit = ball.points[rows], torch.full_like(ball.points[rows, 0], ball.misfit)
+        shared = ball.deviations[rows]
+        return Completion(points, ball.normals[rows], shared, misfit, no_plane, none[:, 0], outline, "ball")
     round_body = None if table is None else find_revolution(scorer.points, scorer.normals)
     axis = find_axis(scorer) if round_body is None else None
     if axis is not None:
         scorer, round_body = scorer.about_axis(axis[0]), axis[1]
     parts = _split(scorer, round_body)
     planes, scores = torch.cat([part.planes for part in parts]), torch.cat([part.scores for part in parts])
-    images = _mirror(parts)
-    images.sort(key=lambda image: -image.score)
-    merged = _merge(scorer, _Image.of(scorer, torch.arange(0), len(planes)), images)
+    images = sorted(_mirror(parts), key=lambda image: -image.score)
+
+    def allowed(image: _Image) -> Bool[Tensor, "n"]:
+        hidden = _hidden(scorer, image.points)
+        if scorer.table is None:
+            return hidden
+        # Free space already bounds the shape at the face on the table.
+        return hidden & ~((scorer.table.height(image.points) < 0.004) & (image.normals @ scorer.table.normal < -0.7))
+
+    merged = merge_hidden(_Image.of(scorer, none, none, len(planes)), images, allowed, _thin)
     chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
     shared, asymmetry = chosen.shared.flatten(1), chosen.variance.sqrt()
     kind: Kind = "guess" if not len(planes) else "mirrored" if round_body is None else "revolution"
@@ -134,26 +129,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     return found if axis is None else found.moved(inverse(axis[0]))
 
 
-def _nothing(scorer: SymmetryScorer) -> Completion:
-    """Return a completion without points, for an object that the image border cuts off."""
-    none, planes = scorer.points[:0], scorer.points.new_zeros(0, 4)
-    return Completion(none, none, none[:, :0], none[:, 0], planes, planes[:, 0], scorer.outline, "cut off")
-
-
-def _hidden_side(scorer: SymmetryScorer, ball: Ellipsoid, budget: int) -> Completion:
-    """Return the hidden side of an ellipsoid; its error is at least the misfit of the seen side."""
-    distance, _ = scorer.nearest(ball.points)
-    rows = torch.nonzero((distance > NEW) & _allowed(scorer, ball.points))[:, 0]
-    rows = rows[farthest_points(ball.points[rows], budget, tie=TIE)]
-    points, misfit = ball.points[rows], torch.full_like(ball.points[rows, 0], ball.misfit)
-    none = points.new_zeros(0, 4)
-    return Completion(
-        points, ball.normals[rows], ball.deviations[rows], misfit, none, none[:, 0], scorer.outline, "ball"
-    )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """A part of the cloud, with its own mirror planes and their scores."""
 
     scorer: SymmetryScorer
@@ -177,46 +153,10 @@ class _Image(Batch):
     shared: Float[Tensor, "n planes near"]
 
     @classmethod
-    def of(cls, scorer: SymmetryScorer, rows: Tensor, n_planes: int) -> "_Image":
-        """Return points of the cloud as an image without errors."""
-        points = scorer.points[rows]
-        near = NEARBY ** (2 if scorer.upright else 3)
-        shared = points.new_zeros(len(rows), n_planes, near)
-        return cls(points, scorer.normals[rows], math.inf, torch.zeros_like(points[:, 0]), shared)
-
-    def with_rim(self, outline: Outlines) -> "_Image":
-        """Return the points together with those of the outline, whose images are edges of the far side."""
-        rim = outline.rim
-        shared = rim.new_zeros(len(rim), *self.shared.shape[1:])
-        return join([self, _Image(rim, outline.rim_normals, math.inf, torch.zeros_like(rim[:, 0]), shared)])
-
-
-@dataclasses.dataclass(frozen=True)
-class _Mirror:
-    """A mirror plane with its number and score, and nearby planes with their probabilities."""
-
-    number: int
-    plane: Tensor
-    score: float
-    near: Tensor
-    weight: Tensor
-
-    @classmethod
-    def of(cls, scorer: SymmetryScorer, number: int, plane: Float[Tensor, "4"], score: Float[Tensor, ""]) -> "_Mirror":
-        """Return a mirror plane with the planes near it and their probabilities."""
-        steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype)
-        near = planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps)
-        return cls(number, plane, float(score), near, torch.softmax(scorer.score(near)[0] / TEMPERATURE, 0))
-
-    def image(self, of: _Image) -> _Image:
-        """Return the mirror image of points or of another image."""
-        points, normals = reflect(of.points, self.plane), reflect_directions(of.normals, self.plane)
-        shift = ((reflect(of.points, self.near[:, None]) - points) * normals).sum(-1)
-        shared = of.shared.clone()  # a mirror leaves errors across the surface as they are
-        shared[:, self.number] += (self.weight.sqrt()[:, None] * shift).T
-        variance = of.variance + (ASYMMETRY * max(SYMMETRIC - self.score, 0.0)) ** 2
-        score = self.score if math.isinf(of.score) else min(of.score, self.score) - 0.05
-        return _Image(points, normals, score, variance, shared)
+    def of(cls, scorer: SymmetryScorer, points: Tensor, normals: Tensor, n_planes: int) -> "_Image":
+        """Return points as an image without errors."""
+        shared = points.new_zeros(len(points), n_planes, NEARBY ** (2 if scorer.upright else 3))
+        return cls(points, normals, math.inf, torch.zeros_like(points[:, 0]), shared)
 
 
 def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]:
@@ -237,49 +177,64 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
     """Return the mirror images of each part, in each plane and in pairs of planes."""
     total, images, before = sum(len(part.planes) for part in parts), [], 0
     for part in parts:
-        original = _Image.of(part.scorer, part.rows, total)
-        if len(part.rows) == len(part.scorer.points):  # the outline is of the whole cloud
-            original = original.with_rim(part.scorer.outline)
-        mirrors = [
-            _Mirror.of(part.scorer, before + i, plane, score)
-            for i, (plane, score) in enumerate(zip(part.planes, part.scores, strict=True))
-        ]
-        once = [mirror.image(original) for mirror in mirrors]
-        twice = [m.image(image) for i, image in enumerate(once[:2]) for j, m in enumerate(mirrors) if i != j]
+        scorer, points, normals = part.scorer, part.scorer.points[part.rows], part.scorer.normals[part.rows]
+        if len(points) == len(scorer.points):  # the outline is of the whole cloud; its images are edges of the far side
+            points = torch.cat([points, scorer.outline.rim])
+            normals = torch.cat([normals, scorer.outline.rim_normals])
+        original = _Image.of(scorer, points, normals, total)
+        planes = enumerate(zip(part.planes, part.scores.tolist(), strict=True), start=before)
+        mirrors = [_mirror_in(scorer, number, plane, score) for number, (plane, score) in planes]
+        once = [mirror(original) for mirror in mirrors]
+        twice = [mirror(image) for i, image in enumerate(once[:2]) for j, mirror in enumerate(mirrors) if i != j]
         images += once + twice
         before += len(mirrors)
     return images
 
 
-def _merge(scorer: SymmetryScorer, merged: _Image, images: list[_Image]) -> _Image:
-    """Add to `merged` the points of images that are allowed, at least `SPACING` apart."""
+def _mirror_in(
+    scorer: SymmetryScorer, number: int, plane: Float[Tensor, "4"], score: float
+) -> Callable[[_Image], _Image]:
+    """Return the function that mirrors points, or another image, in a plane; planes near it give the errors."""
+    steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype)
+    near = planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps)
+    weight = torch.softmax(scorer.score(near)[0] / TEMPERATURE, 0)
+
+    def mirror(of: _Image) -> _Image:
+        points, normals = reflect(of.points, plane), reflect_directions(of.normals, plane)
+        shift = ((reflect(of.points, near[:, None]) - points) * normals).sum(-1)
+        shared = of.shared.clone()  # a mirror leaves errors across the surface as they are
+        shared[:, number] += (weight.sqrt()[:, None] * shift).T
+        variance = of.variance + (ASYMMETRY * max(SYMMETRIC - score, 0.0)) ** 2
+        return _Image(points, normals, score if math.isinf(of.score) else min(of.score, score) - 0.05, variance, shared)
+
+    return mirror
+
+
+def merge_hidden(
+    merged: SomeHidden,
+    parts: Iterable[SomeHidden],
+    allowed: Callable[[SomeHidden], Bool[Tensor, "n"]],
+    thin: Callable[[Float[Tensor, "n 3"]], Int[Tensor, "k"]],
+) -> SomeHidden:
+    """Add to `merged` the allowed points of each part that are `SPACING` apart from earlier parts, thinned."""
     from scipy.spatial import KDTree
 
-    for image in images:
-        distance, _ = scorer.nearest(image.points)
-        new = image[(distance > NEW) & _allowed(scorer, image.points) & ~_on_table(scorer, image)]
+    for part in parts:
+        new = part[allowed(part)]
         if len(merged) and len(new):
             distance, _ = KDTree(merged.points.numpy()).query(new.points.numpy())
             new = new[torch.from_numpy(distance) > SPACING]
-        merged = join([merged, new[_thin(new.points)]])
+        merged = join([merged, new[thin(new.points)]])
     return merged
 
 
-def _allowed(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return which points are excluded neither by a view nor by the table."""
-    outline = scorer.outline
-    allowed = (outline.hull_distance(points) < HULL_MARGIN) & (outline.violation(points) < FRONT_MARGIN)
-    return allowed if scorer.table is None else allowed & (scorer.table.height(points) > -FRONT_MARGIN)
+def _hidden(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Return which points are far from the cloud, hidden in every view, and not below the table."""
+    hidden = (scorer.nearest(points)[0] > NEW) & scorer.outline.hides(points)
+    return hidden if scorer.table is None else hidden & (scorer.table.height(points) > -FRONT_MARGIN)
 
 
-def _on_table(scorer: SymmetryScorer, image: _Image) -> Bool[Tensor, "n"]:
-    """Return which points of an image are on the face on the table, where free space already bounds the shape."""
-    if scorer.table is None:
-        return torch.zeros(len(image), dtype=torch.bool)
-    return (scorer.table.height(image.points) < 0.004) & (image.normals @ scorer.table.normal < -0.7)
-
-
-def _thin(points: Float[Tensor, "n 3"]) -> Tensor:
+def _thin(points: Float[Tensor, "n 3"]) -> Int[Tensor, "k"]:
     """Return the indices of points that are at least `SPACING` apart, earlier points first."""
     apart = (torch.cdist(points, points) >= SPACING).numpy()  # NumPy's calls cost a quarter of torch's
     keep = np.ones(len(points), dtype=bool)

@@ -4,14 +4,14 @@ import dataclasses
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import farthest_points, unit
+from torchgrasp.geometry.linalg import across, farthest_points, unit
 from torchgrasp.values import PointCloud
 
 GROW, SHRINK = 2.0, 1.65
@@ -121,6 +121,10 @@ class Outlines(Value):
         """Return the greatest violation [m] of any view by each point."""
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
+    def hides(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
+        """Return which points no view excludes: they may lie 1 mm outside the hull."""
+        return (self.hull_distance(points) < 0.001) & (self.violation(points) < FRONT_MARGIN)
+
 
 @checked
 def silhouettes(cloud: PointCloud) -> Outlines:
@@ -228,18 +232,10 @@ def _project(
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
     """Return the axes of a camera that faces the points, and the points' pixels and depths [m]."""
     points, viewpoint = points.double().cpu(), viewpoint.double().cpu()
-    axes = _camera_axes((points.amax(0) + points.amin(0)) / 2 - viewpoint)
+    forward = unit((points.amax(0) + points.amin(0)) / 2 - viewpoint)
+    axes = torch.stack([*across(forward), forward])  # right, down, forward
     local = (points - viewpoint) @ axes.T
     return axes, local[:, :2] / local[:, 2:], local[:, 2]
-
-
-def _camera_axes(forward: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Return the right, down and forward axes of a camera with a given viewing direction, as rows."""
-    forward = unit(forward)
-    helper = torch.zeros_like(forward)
-    helper[forward.abs().argmin()] = 1.0
-    right = unit(torch.linalg.cross(forward, helper))
-    return torch.stack([right, torch.linalg.cross(forward, right), forward])
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:

@@ -1,7 +1,9 @@
 """Mirror planes of a partial cloud: the mirror image must lie on the cloud or be hidden, not in free space."""
 
 import dataclasses
+import functools
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,6 +15,9 @@ from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, reflec
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 MATCH_DISTANCE = 0.003  # distance [m] over which a mirrored point stops matching the cloud
 PROBES = 150  # points of the cloud that score a plane
@@ -28,49 +33,56 @@ MAX_VIOLATION = 0.15  # greatest mean violation of free space, in [0, 1], of a p
 SLOPE = 0.15  # a plane near the best one is dropped if its score is less by this: it matches only because it is near
 AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.4
 """The axis of a body of revolution in its frame, and the least score of the plane that mirrors its ends."""
+Mirror = Float[Tensor, "4"]
+Mirrors = Float[Tensor, "_ 4"]
+"""Mirror planes n.x = o, given as (n, o)."""
+Directions = Float[Tensor, "d 3"]
+View = Float[Tensor, "3"] | None
+"""The direction of the view; None: from above or from several sides, where no side alone is hidden."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryScorer:
-    """Scores mirror planes: compares mirrored `probes` with the cloud, its outlines and the table.
+    """Scores mirror planes: compares mirrored probes, the points `rows`, with the cloud, its outlines and the table.
 
     `upright` means that all planes are parallel to z: the vertical direction, or the axis of a body of revolution.
     """
 
-    points: Tensor
-    normals: Tensor
-    tree: object
+    points: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"]
     outline: Outlines
     table: Plane | None
     upright: bool
-    probes: Tensor
-    probe_normals: Tensor
+    rows: Int[Tensor, "k"]
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
         """Return the scorer of a cloud with normals, with probes from all points. `table` is the table's height [m]."""
-        from scipy.spatial import KDTree
-
         assert cloud.normals is not None
-        points, normals, plane = cloud.points, cloud.normals, None if table is None else Plane.horizontal(table)
-        tree, upright = KDTree(points.numpy(), leafsize=32), table is not None
-        whole = cls(points, normals, tree, silhouettes(cloud), plane, upright, points[:0], normals[:0])
-        return whole.for_part(torch.arange(len(cloud)))
+        plane, every = None if table is None else Plane.horizontal(table), torch.arange(len(cloud))
+        return cls(cloud.points, cloud.normals, silhouettes(cloud), plane, table is not None, every).for_part(every)
 
     def about_axis(self, axis_from_cloud: Float[Tensor, "4 4"]) -> "SymmetryScorer":
         """Return the scorer in another frame, whose z axis is an axis of revolution."""
-        from scipy.spatial import KDTree
-
         points, normals = apply(axis_from_cloud, self.points), rotate(axis_from_cloud, self.normals)
         table = None if self.table is None else self.table.moved(axis_from_cloud)
-        probes, probe_normals = apply(axis_from_cloud, self.probes), rotate(axis_from_cloud, self.probe_normals)
-        outline, tree = self.outline.moved(axis_from_cloud), KDTree(points.numpy(), leafsize=32)
-        return SymmetryScorer(points, normals, tree, outline, table, True, probes, probe_normals)
+        return SymmetryScorer(points, normals, self.outline.moved(axis_from_cloud), table, True, self.rows)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
         """Return the scorer with probe points from the given points of the cloud only."""
-        rows = rows[farthest_points(self.points[rows], PROBES, tie=TIE)]
-        return dataclasses.replace(self, probes=self.points[rows], probe_normals=self.normals[rows])
+        return dataclasses.replace(self, rows=rows[farthest_points(self.points[rows], PROBES, tie=TIE)])
+
+    @functools.cached_property
+    def probes(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
+        """The probe points [m] and their normals."""
+        return self.points[self.rows], self.normals[self.rows]
+
+    @functools.cached_property
+    def tree(self) -> "KDTree":
+        """The search tree of the cloud's points."""
+        from scipy.spatial import KDTree
+
+        return KDTree(self.points.numpy(), leafsize=32)
 
     @property
     def center(self) -> Tensor:
@@ -84,7 +96,7 @@ class SymmetryScorer:
 
     def nearest(self, points: Tensor, limit: float = math.inf) -> tuple[Tensor, Tensor]:
         """Return distance [m] and index of the nearest cloud point; infinity and 0 beyond the limit."""
-        distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)  # pyright: ignore
+        distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)
         shape = points.shape[:-1]
         index = torch.from_numpy(np.where(np.isinf(distance), 0, index)).reshape(shape)
         return torch.from_numpy(distance).reshape(shape), index
@@ -94,8 +106,8 @@ class SymmetryScorer:
 
         The score is the match of the mirror image with the cloud, minus twice the violation.
         """
-        mirrored = reflect(self.probes, planes[:, None])
-        normals = reflect_directions(self.probe_normals, planes[:, None])
+        mirrored = reflect(self.probes[0], planes[:, None])
+        normals = reflect_directions(self.probes[1], planes[:, None])
         distance, index = self.nearest(mirrored, 4 * MATCH_DISTANCE)
         agreement = (normals * self.normals[index]).sum(-1).clamp_min(0)
         match = (torch.exp(-0.5 * (distance / MATCH_DISTANCE) ** 2) * agreement).mean(-1)
@@ -106,13 +118,12 @@ class SymmetryScorer:
         return match - 2.0 * violation, violation
 
 
-def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Float[Tensor, "p 4"], Float[Tensor, "p"]]:
+def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, Float[Tensor, "p"]]:
     """Return the mirror planes of a cloud, best first, and their scores.
 
-    Planes from a grid are scored and the best are refined; on a table only vertical planes are tried. On a table a
-    plane perpendicular to the best is added if no plane is near it: its own score says little, because its images are
-    hidden. A horizontal plane halfway up gives the underside. A body of revolution (`turned`) needs neither, because
-    all planes through its axis match.
+    On a table only vertical planes are tried. A plane perpendicular to the best is added if no plane is near it,
+    because its images are hidden; a horizontal plane halfway up gives the underside. All planes through the axis of a
+    body of revolution (`turned`) match: it needs neither.
     """
     view = torch.stack([unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]).mean(0)
     if not scorer.upright:
@@ -139,7 +150,8 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Float[Ten
         best = _refine(scorer, grid[strongest, int(scores[strongest].argmax())])
         planes = _without_slope(scorer, planes, best)
         planes += list(_square_plane(scorer, planes, best, across))
-        planes += list(_level_plane(scorer, scorer.table))
+        half = ((scorer.points[:, 2].max() + scorer.table.offset) / 2)[None, None]
+        planes += list(_best_plane(scorer, torch.cat([AXIS, half], 1), 0.0))
     if not planes:
         return scorer.points.new_zeros(0, 4), scorer.points.new_zeros(0)
     found = torch.stack(planes)
@@ -165,8 +177,8 @@ def find_plane_through_axis(
 
 
 def planes_near(
-    scorer: SymmetryScorer, plane: Float[Tensor, "4"], angles: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
-) -> Float[Tensor, "p 4"]:
+    scorer: SymmetryScorer, plane: Mirror, angles: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
+) -> Mirrors:
     """Return planes near a plane: rotated by `angles` [rad] and shifted [m]; if `upright`, rotated about z only."""
     normal = plane[:3]
     if scorer.upright:
@@ -186,9 +198,7 @@ def _level_directions(n: int) -> Float[Tensor, "n 3"]:
     return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
 
 
-def _plane_grid(
-    scorer: SymmetryScorer, directions: Float[Tensor, "d 3"], count: int = OFFSETS
-) -> Float[Tensor, "d k 4"]:
+def _plane_grid(scorer: SymmetryScorer, directions: Directions, count: int = OFFSETS) -> Float[Tensor, "d k 4"]:
     """Return planes with the given normals, at offsets over the cloud's extent."""
     along = scorer.points @ directions.T
     low, high = along.amin(0), along.amax(0)
@@ -197,9 +207,7 @@ def _plane_grid(
     return torch.cat([directions[:, None].expand(-1, count, -1), offsets[..., None]], -1)
 
 
-def _pick_planes(
-    scores: Float[Tensor, "d k"], directions: Float[Tensor, "d 3"], across: Float[Tensor, "3"] | None
-) -> list[tuple[int, int]]:
+def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: View) -> list[tuple[int, int]]:
     """Return the grid indices of the best planes that hide points from the view and differ enough in direction."""
     best, offset = scores.max(1)
     hides = _hides(directions, across)
@@ -213,25 +221,18 @@ def _pick_planes(
     return [(i, int(offset[i])) for i in chosen]
 
 
-def _hides(directions: Float[Tensor, "d 3"], across: Float[Tensor, "3"] | None) -> Bool[Tensor, "d"]:
+def _hides(directions: Directions, across: View) -> Bool[Tensor, "d"]:
     """Return which planes, given by their normals, can have hidden mirror images; all, if `across` is None."""
     return torch.ones(len(directions), dtype=torch.bool) if across is None else (directions @ across).abs() > MIN_FACING
 
 
-def _without_slope(
-    scorer: SymmetryScorer, planes: list[Float[Tensor, "4"]], best: Float[Tensor, "4"]
-) -> list[Float[Tensor, "4"]]:
+def _without_slope(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror) -> list[Mirror]:
     """Remove planes that score well only because they are near the best plane."""
     least = float(scorer.score(best[None])[0]) - SLOPE
     return [p for p in planes if abs(float(p[:3] @ best[:3])) < APART or float(scorer.score(p[None])[0]) > least]
 
 
-def _across_plane(
-    scorer: SymmetryScorer,
-    planes: list[Float[Tensor, "4"]],
-    grid: Float[Tensor, "d k 4"],
-    across: Float[Tensor, "3"] | None,
-) -> Float[Tensor, "p 4"]:
+def _across_plane(scorer: SymmetryScorer, planes: list[Mirror], grid: Float[Tensor, "d k 4"], across: View) -> Mirrors:
     """Return the best plane that faces the view, if `planes` has no such plane; none if all violate free space."""
     if across is None or any(abs(float(plane[:3] @ across)) > FACING for plane in planes):
         return grid.new_zeros(0, 4)
@@ -239,12 +240,7 @@ def _across_plane(
     return torch.stack([_refine(scorer, plane) for plane in found]) if len(found) else found
 
 
-def _square_plane(
-    scorer: SymmetryScorer,
-    planes: list[Float[Tensor, "4"]],
-    best: Float[Tensor, "4"],
-    across: Float[Tensor, "3"] | None,
-) -> Float[Tensor, "p 4"]:
+def _square_plane(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror, across: View) -> Mirrors:
     """Return the best vertical plane perpendicular to another, if it can add hidden points and no plane is near it."""
     direction = torch.stack([-best[1], best[0], torch.zeros_like(best[0])])[None]
     near = any(abs(float(plane[:3] @ direction[0])) > 0.42 for plane in planes)
@@ -253,13 +249,7 @@ def _square_plane(
     return _best_plane(scorer, _plane_grid(scorer, direction, FINE_OFFSETS)[0], -math.inf)
 
 
-def _level_plane(scorer: SymmetryScorer, table: Plane) -> Float[Tensor, "p 4"]:
-    """Return the horizontal plane halfway up an object on a table; none if its mirror image does not match."""
-    half = (scorer.points[:, 2].max() + table.offset) / 2
-    return _best_plane(scorer, torch.stack([0 * half, 0 * half, 0 * half + 1, half])[None], 0.0)
-
-
-def _best_plane(scorer: SymmetryScorer, planes: Float[Tensor, "k 4"], least: float) -> Float[Tensor, "p 4"]:
+def _best_plane(scorer: SymmetryScorer, planes: Mirrors, least: float) -> Mirrors:
     """Return the plane of the greatest score above `least` that does not violate free space; or none."""
     if not len(planes):
         return planes
@@ -268,7 +258,7 @@ def _best_plane(scorer: SymmetryScorer, planes: Float[Tensor, "k 4"], least: flo
     return planes[scores.argmax()][None][scores.max()[None] > least]
 
 
-def _refine(scorer: SymmetryScorer, plane: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
+def _refine(scorer: SymmetryScorer, plane: Mirror) -> Mirror:
     """Return the plane after three grid searches, each half as wide as the last."""
     steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype)
     for width in (1.0, 0.5, 0.25):

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value, join
+from torchgrasp.base import Batch, Value
 from torchgrasp.geometry.linalg import farthest_points, solve_least_squares, unit
-from torchgrasp.shape.completion.axis import fit_axis
-from torchgrasp.shape.completion.complete import FRONT_MARGIN, HULL_MARGIN, NEW, SPACING
+from torchgrasp.shape.completion.axis import fit_axis, rotations_about_z
+from torchgrasp.shape.completion.complete import NEW, merge_hidden
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.values import PointCloud
 
@@ -162,15 +162,6 @@ def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
     return HiddenWall(points.flatten(0, 1), normals.flatten(0, 1), shared.flatten(0, 1))
 
 
-def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
-    """Return the rotations about z by k / n of a full circle, for k from 1 to n - 1."""
-    angle = torch.arange(1, n, dtype=torch.float64) * (2 * math.pi / n)
-    turn = torch.zeros(n - 1, 3, 3, dtype=torch.float64)
-    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
-    turn[:, 2, 2] = 1.0
-    return turn
-
-
 def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float, int], ...]) -> HiddenWall:
     """Return horizontal points with normals up on rings about the axis; `rings`: relative radius, number of points."""
     places = []
@@ -191,12 +182,11 @@ def _merge(
     """Return points of the parts, first parts first, that are new, hidden, below the rim and above height `least`."""
     from scipy.spatial import KDTree
 
-    tree, merged = KDTree(seen.numpy()), parts[0][:0]
-    for part in parts:
-        part = part[(part.points[:, 2] < vessel.rim - RIM) & (part.points[:, 2] >= least)]
-        allowed = (outline.hull_distance(part.points) < HULL_MARGIN) & (outline.violation(part.points) < FRONT_MARGIN)
-        new = part[allowed & torch.from_numpy(tree.query(part.points.numpy())[0] > NEW)]
-        if len(merged) and len(new):
-            new = new[torch.from_numpy(KDTree(merged.points.numpy()).query(new.points.numpy())[0] > SPACING)]
-        merged = join([merged, new[farthest_points(new.points, 4 * 50, tie=TIE)]]) if len(new) else merged
+    tree = KDTree(seen.numpy())
+
+    def allowed(part: HiddenWall) -> Bool[Tensor, "n"]:
+        within = (part.points[:, 2] < vessel.rim - RIM) & (part.points[:, 2] >= least)
+        return within & outline.hides(part.points) & torch.from_numpy(tree.query(part.points.numpy())[0] > NEW)
+
+    merged = merge_hidden(parts[0][:0], parts, allowed, lambda points: farthest_points(points, 4 * 50, tie=TIE))
     return merged[farthest_points(merged.points, 50, tie=TIE)]
