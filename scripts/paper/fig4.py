@@ -1,16 +1,15 @@
 """Fig. 4 of the paper with the objects of torchgrasp: clouds, whole and partial, and the shapes that follow."""
 
-import io
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
+from paper.sheet import render_tile, save_sheet
 from paper.table3 import sample_whole
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
-from torchgrasp.app.report.canvas import INK, PAPER, Canvas, draw_bar, map_colors
+from torchgrasp.app.report.canvas import INK, Canvas, map_colors
 from torchgrasp.app.report.stills import rotated, view_of
-from torchgrasp.files import write_file
 from torchgrasp.shape.surface import Surface, extract_surface
 
 TILE = (340, 360)
@@ -50,20 +49,14 @@ def fig4(out: Path, seed: int = 0) -> None:
         scenes.append((thing, clouds, surfaces, arrows))
     # One scale for all, the most certain 80 % of each: the least certain bulges would leave all else in one colour.
     most = 1e3 * max(float(surface.std_m.quantile(0.8)) for _, _, surfaces, _ in scenes for surface in surfaces)
-    sheet = Image.new("RGB", (TILE[0] * len(scenes), TILE[1] * len(ROWS) + 110), PAPER)
-    for column, (thing, clouds, surfaces, arrows) in enumerate(scenes):
-        eye = rotated(view_of(thing.view), TURN)
-        corners = np.asarray(thing.mesh.vertices)
+    columns = []
+    for thing, clouds, surfaces, arrows in scenes:
+        eye, corners = rotated(view_of(thing.view), TURN), np.asarray(thing.mesh.vertices)
         drawn = list(zip(surfaces, arrows, strict=True))
-        rows = ((clouds[0], None), drawn[0], (clouds[1], None), *drawn[1:])
-        for row, (what, normals) in enumerate(rows):
-            sheet.paste(draw(what, normals, most, corners, eye), (column * TILE[0], row * TILE[1] + 30))
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(22)
-    for row, title in enumerate(ROWS):
-        pen.text((12, row * TILE[1] + 10), title, INK, font)
-    draw_bar(sheet, "standard deviation of the surface [mm]", most, "viridis")
-    write_file(out / "fig4.png", lambda file: sheet.save(file, format="PNG"))
-    print(out / "fig4.png")
+        column = ((clouds[0], None), drawn[0], (clouds[1], None), *drawn[1:])
+        columns.append([draw(what, normals, most, corners, eye) for what, normals in column])
+    titles = {(row, 0): title for row, title in enumerate(ROWS)}
+    save_sheet(out / "fig4.png", list(zip(*columns, strict=True)), titles, most)
 
 
 def observed_normals(shape: ShapeGP) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +85,4 @@ def draw(
     if arrows:
         length = ARROW * float(np.linalg.norm(np.ptp(corners, axis=0)))
         canvas.add_arrows(*arrows, length, (INK,) * len(arrows[0]))
-    picture = Image.open(io.BytesIO(canvas.render_png(corners, eye)))
-    width, height = round(picture.width * TILE[1] / picture.height), TILE[1]
-    left = (width - TILE[0]) // 2  # the objects are taller than wide
-    return picture.resize((width, height), Image.Resampling.LANCZOS).crop((left, 0, left + TILE[0], height))
+    return render_tile(canvas, corners, eye, TILE)

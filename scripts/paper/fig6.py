@@ -78,6 +78,5 @@ def draw_selection(curves: dict[str, tuple[BicCurve, CrossValidation]], out: Pat
             axis.set_title(name)
             axis.grid(alpha=0.3)
         row[0].legend()
-    out.parent.mkdir(parents=True, exist_ok=True)
     write_file(out, lambda file: figure.savefig(file, format="png", dpi=110))
     print(out)

@@ -1,15 +1,15 @@
 """Figs. 9 to 12 of the paper: contacts that hands take, in more than one way and with more than one hand."""
 
 import dataclasses
-import io
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Int
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from torch import Tensor
 
+from paper.sheet import render_tile, save_sheet
 from torchgrasp import (
     Contacts,
     ContactSpec,
@@ -25,10 +25,9 @@ from torchgrasp import (
     plan_contacts,
     plan_grasps,
 )
-from torchgrasp.app.report.canvas import AXES, FINGERS, INK, OBJECT, PAPER, Canvas, Direction
+from torchgrasp.app.report.canvas import AXES, FINGERS, OBJECT, Canvas, Direction
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import facing
-from torchgrasp.files import write_file
 from torchgrasp.geometry.frames import virtual_frame
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.attempts import rank_seeds, refine_on_contacts
@@ -142,19 +141,12 @@ def shared_triple(first: Taken, second: Taken) -> list[tuple[Taken, int]]:
 
 def save(rows: list[list[tuple[Taken, int]]], path: Path) -> None:
     """Draw grasps, those of one contact triple in a row and from one eye, else two in a row."""
-    shown = [(*one, eye_of(row)) for row in rows for one in row]
-    sheet = Image.new("RGB", (2 * TILE[0], max(-(-len(shown) // 2), 1) * TILE[1]), PAPER)
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(18)
-    for k, (taken, index, eye) in enumerate(shown):
-        corner = (k % 2 * TILE[0], k // 2 * TILE[1])
-        sheet.paste(draw(taken, index, eye).resize(TILE, Image.Resampling.LANCZOS), corner)
+    shown, captions = [(*one, eye_of(row)) for row in rows for one in row], {}
+    for k, (taken, index, _) in enumerate(shown):
         worst = 1e3 * float(taken.grasps.tip_error[index].max())
-        pen.text(
-            (corner[0] + 10, corner[1] + 8), f"{taken.chain}{taken.hand.name}, tips within {worst:.2f} mm", INK, font
-        )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, lambda file: sheet.save(file, format="PNG"))
-    print(path)
+        captions[divmod(k, 2)] = f"{taken.chain}{taken.hand.name}, tips within {worst:.2f} mm"
+    pictures = [draw(*one) for one in shown]
+    save_sheet(path, [pictures[k : k + 2] for k in range(0, len(pictures), 2)], captions)
 
 
 def eye_of(row: list[tuple[Taken, int]]) -> Direction:
@@ -178,7 +170,7 @@ def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color)
     _add_frame(canvas, contacts)
     corners = np.concatenate([vertices, *(s.vertices for s in solids)])
-    return Image.open(io.BytesIO(canvas.render_png(corners, eye)))
+    return render_tile(canvas, corners, eye, TILE)
 
 
 def _add_frame(canvas: Canvas, contacts: Contacts) -> None:

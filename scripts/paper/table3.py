@@ -60,7 +60,6 @@ def table3(out: Path, seed: int = 0) -> None:
             label, points, first, second = PUBLISHED[name]
             beside = f"   {label} {points}, {first} s, {second} s" if cloud == "whole" else ""
             print(f"{name:10}{setting:9}{cloud:9}{len(shape.x):7}{filtering:10.2f}{modelling:9.3f}{beside}", flush=True)
-    out.mkdir(parents=True, exist_ok=True)
     write_file(out / "table3.json", json.dumps({"seed": seed, "rows": rows, "published": PUBLISHED}, indent=1))
 
 

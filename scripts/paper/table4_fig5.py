@@ -1,6 +1,5 @@
 """Table 4 and Fig. 5 of the paper with the objects of torchgrasp: what the contact planner finds."""
 
-import io
 import itertools
 import json
 import time
@@ -9,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from torch import Tensor
 
+from paper.sheet import render_tile, save_sheet
 from torchgrasp import (
     Contacts,
     ContactSpec,
@@ -23,7 +23,7 @@ from torchgrasp import (
     load_object,
     plan_contacts,
 )
-from torchgrasp.app.report.canvas import INK, PAPER, Canvas, draw_bar, map_colors
+from torchgrasp.app.report.canvas import Canvas, map_colors
 from torchgrasp.app.report.stills import rotated
 from torchgrasp.files import write_file
 from torchgrasp.geometry.linalg import farthest_points
@@ -77,7 +77,6 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
                 rows.append(row)
                 print(line(row), flush=True)
     content = {"starts": starts, "seed": seed, "rows": rows, "published": PUBLISHED}
-    out.mkdir(parents=True, exist_ok=True)
     write_file(out / "table4.json", json.dumps(content, indent=1))
 
 
@@ -140,16 +139,8 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
             flush=True,
         )
     most = 1e3 * max(float(surface.std_m.quantile(0.9)) for _, surface, _ in scenes)
-    sheet = Image.new("RGB", (TILE[0] * len(scenes), TILE[1] * SHOWN + 110), PAPER)
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(22)
-    for column, (name, surface, shown) in enumerate(scenes):
-        for row, contacts in enumerate(shown):
-            sheet.paste(draw(surface, contacts, most), (column * TILE[0], row * TILE[1] + 30))
-        pen.text((column * TILE[0] + 12, 8), name, INK, font)
-    draw_bar(sheet, "standard deviation of the surface [mm]", most, "viridis")
-    out.mkdir(parents=True, exist_ok=True)
-    write_file(out / "fig5.png", lambda file: sheet.save(file, format="PNG"))
-    print(out / "fig5.png")
+    rows = [[draw(surface, shown[k], most) for _, surface, shown in scenes] for k in range(SHOWN)]
+    save_sheet(out / "fig5.png", rows, {(0, column): name for column, (name, *_) in enumerate(scenes)}, most)
 
 
 def unlike(contacts: Contacts, count: int) -> Contacts:
@@ -174,7 +165,4 @@ def draw(surface: Surface, contacts: Contacts, most: float) -> Image.Image:
     facing = [np.sort(outward @ eye) for eye in eyes]
     eye = eyes[int(np.argmax([f[0] + 0.5 * f[1] for f in facing]))]
     corners = np.concatenate([vertices, points + ARROW * outward])
-    picture = Image.open(io.BytesIO(canvas.render_png(corners, eye)))
-    width = round(picture.width * TILE[1] / picture.height)
-    left = (width - TILE[0]) // 2
-    return picture.resize((width, TILE[1]), Image.Resampling.LANCZOS).crop((left, 0, left + TILE[0], TILE[1]))
+    return render_tile(canvas, corners, eye, TILE)

@@ -5,7 +5,6 @@ touch with the middles of their pads, and uniform postures, as the paper tested.
 """
 
 import dataclasses
-import io
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -13,10 +12,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from paper.sheet import render_tile, save_sheet
 from torchgrasp import Hand, load_hand, load_mixture
 from torchgrasp.app.report.canvas import FINGERS, GRID, INK, PAPER, Canvas, Direction
 from torchgrasp.app.report.solids import solids_from_hand
@@ -121,15 +121,12 @@ def fig7(out: Path, n: int = 100_000, seed: int = 1) -> None:
         seed: of their draw.
     """
     errors = measure_errors("barrett", n, seed)
-    sheet = Image.new("RGB", (2 * TILE[0], 2 * TILE[1]), PAPER)
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(19)
+    pictures, captions = [], {}
     for k, row in enumerate(errors.cases()):
-        corner = (k % 2 * TILE[0], k // 2 * TILE[1])
-        picture = draw_both(errors.hand, errors.joints[row], errors.predicted[row])
-        sheet.paste(picture.resize(TILE, Image.Resampling.LANCZOS), corner)
+        pictures.append(draw_both(errors.hand, errors.joints[row], errors.predicted[row]))
         numbers = ", ".join(f"{x:.2f}" for x in errors.error[row].tolist())
-        pen.text((corner[0] + 12, corner[1] + 10), f"case {k + 1}: off by {numbers} rad", INK, font)
-    _save(sheet, out / "fig7.png")
+        captions[divmod(k, 2)] = f"case {k + 1}: off by {numbers} rad"
+    save_sheet(out / "fig7.png", [pictures[:2], pictures[2:]], captions)
 
 
 def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
@@ -159,7 +156,6 @@ def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
     axes.set_axisbelow(True)
     axes.legend(frameon=False, loc="upper right")
     axes.spines[["top", "right"]].set_visible(False)
-    out.mkdir(parents=True, exist_ok=True)
     write_file(out / "fig8.png", lambda file: figure.savefig(file, format="png"))
     for name, error, deviation in zip(errors.hand.joint_names, mean, spread, strict=True):
         print(f"{name:10}{error:8.3f} +- {deviation:.3f}")
@@ -175,18 +171,10 @@ def draw_both(hand: Hand, true: Float[Tensor, "h"], predicted: Float[Tensor, "h"
         for solid in solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).double()):
             canvas.add_mesh(solid.vertices, solid.faces, solid.color, transparent=transparent)
             corners.append(solid.vertices)
-    return Image.open(io.BytesIO(canvas.render_png(np.concatenate(corners), EYE)))
-
-
-def _save(sheet: Image.Image, path: Path) -> None:
-    """Write a picture and print its path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, lambda file: sheet.save(file, format="PNG"))
-    print(path)
+    return render_tile(canvas, np.concatenate(corners), EYE, TILE)
 
 
 def _write(out: Path, name: str, content: dict[str, Any]) -> None:
     """Write numbers and the paper's numbers as JSON."""
-    out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(content | {"published": PUBLISHED}, indent=1)
     write_file(out / f"{name}.json", text)
