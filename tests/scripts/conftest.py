@@ -16,6 +16,13 @@ from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import Status
 
 
+@pytest.fixture(autouse=True)
+def _simulator(request):
+    """Skip simulations without SAPIEN."""
+    if request.node.get_closest_marker("sim"):
+        pytest.importorskip("sapien")
+
+
 @pytest.fixture
 def tin(tmp_path):
     """A folder with a standing cylinder, seen from one side."""

@@ -27,15 +27,12 @@ def test_the_long_description_leads_nowhere_inside_the_project():
     assert [x for x in readme.splitlines() if x.startswith("#")] == [x for x in shown.splitlines() if x.startswith("#")]
 
 
-def test_a_failing_command_ends_with_its_last_words(tmp_path):
-    with pytest.raises(SystemExit, match=r"ended with 3:\nthe reason"):
-        package.run(sys.executable, "-c", "import sys; print('the reason'); sys.exit(3)", cwd=tmp_path)
-    assert package.run(sys.executable, "-c", "import sys; sys.exit(1)", cwd=tmp_path, codes=(1,)) == ""
-
-
-def test_the_surrounding_package_is_hidden_from_commands(tmp_path, monkeypatch):
+def test_run_hides_the_surrounding_package_and_ends_with_the_last_words(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     assert package.run(sys.executable, "-c", "import os; print('PYTHONPATH' in os.environ)", cwd=tmp_path) == "False\n"
+    assert package.run(sys.executable, "-c", "import sys; sys.exit(1)", cwd=tmp_path, codes=(1,)) == ""
+    with pytest.raises(SystemExit, match=r"ended with 3:\nthe reason"):
+        package.run(sys.executable, "-c", "import sys; print('the reason'); sys.exit(3)", cwd=tmp_path)
 
 
 def test_one_interpreter_of_each_version_is_found(tmp_path, monkeypatch):

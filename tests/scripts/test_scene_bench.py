@@ -11,13 +11,13 @@ from benchmarks.scene.clutter import SceneScore, Try, change_masks, clear_scene,
 from benchmarks.scene.drop import PlacedScene, drop
 from benchmarks.scene.scenes import scatter
 
+from tests.make import box
 from tests.pinch import QUICK, cylinder, pinch
 from torchgrasp.cloud.camera import look_at
 from torchgrasp.errors import Status
 
-
-def box(centre, size=(0.04, 0.04, 0.06)):
-    return trimesh.creation.box(size).apply_translation([*centre, size[2] / 2])
+pytestmark = pytest.mark.filterwarnings("ignore")
+SIZE = (0.04, 0.04, 0.06)
 
 
 def place(*meshes):
@@ -29,11 +29,9 @@ def place(*meshes):
 def test_scatter_places_meshes_upright_and_apart():
     meshes = [trimesh.creation.box([0.05 + 0.01 * i, 0.15, 0.1]) for i in range(5)]
     poses = scatter(meshes, torch.Generator().manual_seed(3), 0.3, 0.02)
-    corners = []
-    for mesh, pose in zip(meshes, poses, strict=True):
-        placed = mesh.copy().apply_transform(pose.numpy())
-        assert abs(placed.bounds[0, 2]) < 1e-12 and np.linalg.norm(placed.vertices[:, :2], axis=1).max() <= 0.3
-        corners.append(torch.from_numpy(placed.sample(2000, seed=0)[:, :2]))
+    placed = [mesh.copy().apply_transform(pose.numpy()) for mesh, pose in zip(meshes, poses, strict=True)]
+    assert all(abs(x.bounds[0, 2]) < 1e-12 and np.hypot(*x.vertices[:, :2].T).max() <= 0.3 for x in placed)
+    corners = [torch.from_numpy(mesh.sample(2000, seed=0)[:, :2]) for mesh in placed]
     assert min(float(torch.cdist(corners[i], corners[j]).min()) for i in range(5) for j in range(i)) >= 0.02 - 1e-9
 
 
@@ -46,9 +44,7 @@ def test_change_masks_uses_chessboard_distance():
 
 
 @pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
 def test_dropped_scenes_are_repeatable_at_rest_and_within_reach():
-    pytest.importorskip("sapien")
     scene, again = drop(None, (2, 2), 4), drop(None, (2, 2), 4)
     assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(scene.meshes, again.meshes, strict=True))
     assert -2e-3 < min(mesh.bounds[0, 2] for mesh in scene.meshes) < 1e-3
@@ -56,20 +52,16 @@ def test_dropped_scenes_are_repeatable_at_rest_and_within_reach():
 
 
 @pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
 def test_run_scene_trial_lifts_the_target_and_reports_a_carried_neighbour():
-    pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
-    free = run_scene_trial(place(box((-0.3, 0.3)), cylinder()), 2, grasp, hand, QUICK)
+    free = run_scene_trial(place(box(SIZE, (-0.3, 0.3)), cylinder()), 2, grasp, hand, QUICK)
     assert free.status is Status.OK and free.name == "1" and not free.early and free.moved < 1e-3 and not free.toppled
     plate = trimesh.creation.box([0.05, 0.05, 0.01]).apply_translation([0.0, 0.0, 0.185])
     assert run_scene_trial(place(cylinder(), plate), 1, grasp, hand, QUICK).moved > 0.02
 
 
 @pytest.mark.sim
-@pytest.mark.filterwarnings("ignore")
 def test_clear_scene_lifts_objects_until_none_has_a_grasp():
-    pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
 
     def planner(scene, seed):
@@ -78,7 +70,7 @@ def test_clear_scene_lifts_objects_until_none_has_a_grasp():
         things = (SimpleNamespace(label=k, grasps=x, reason="" if x else "a box") for k, x in found.items())
         return SimpleNamespace(things=tuple(things))
 
-    result = clear_scene(place(cylinder(), box((-0.25, 0.2))), hand, planner, QUICK)
+    result = clear_scene(place(cylinder(), box(SIZE, (-0.25, 0.2))), hand, planner, QUICK)
     assert [(one.name, one.status) for one in result.tries] == [("0", Status.OK)]
     assert result.left == ("1",) and result.reason == "a box"
 

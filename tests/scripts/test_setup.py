@@ -76,49 +76,33 @@ def set_up(tmp_path):
     return run
 
 
-@pytest.fixture
-def wheel(tmp_path):
-    path = tmp_path / "torch.whl"
-    path.write_bytes(bytes(150_000_000 // 1000))
-    return path
+CPU, CUDA = (), ("nvidia-cublas-cu12; platform_system == 'Linux'",)
+CASES = {
+    "the configured index has a CPU build": (CPU, {}, False, ""),
+    "PyTorch's index has a CPU build": (CUDA, {"own": True}, True, "looking for a CPU build"),
+    "a CPU build is asked for beside a GPU": (CUDA, {"own": True, "gpu": True, "TORCHGRASP_CUDA": "0"}, True, ""),
+    "there is no CPU build": (CUDA, {}, False, "taking the CUDA build, 2.3 GB"),
+    "there is a GPU": (CUDA, {"own": True, "gpu": True}, False, "taking the CUDA build, 2.3 GB"),
+    "torch is installed": (CUDA, {"own": True, "installed": True}, False, ""),
+    "a CUDA build is asked for": (CUDA, {"own": True, "TORCHGRASP_CUDA": "1"}, False, ""),
+}
+"""What the configured build of torch needs, the surroundings, whether PyTorch's index is used, and what is told."""
 
 
-CUDA = "nvidia-cublas-cu12; platform_system == 'Linux'"
-
-
-def test_setup_takes_the_cpu_build_of_the_configured_index(set_up, wheel):
-    done, installs = set_up(configured=report(wheel))
-    assert done.returncode == 0, done.stderr
-    assert "torch==" in installs[0] and "--index-url" not in installs[0]
-    assert len(installs) == 2 and "-e .[sim,mujoco,cluster,dev,docs]" in installs[1]
-    done, installs = set_up(configured=report(wheel))  # a second run does nothing
-    assert done.returncode == 0 and installs == [] and done.stdout == ""
-
-
-@pytest.mark.parametrize("more", [{}, {"gpu": True, "TORCHGRASP_CUDA": "0"}], ids=["no GPU", "asked for"])
-def test_setup_looks_for_a_cpu_build_in_its_own_index(set_up, wheel, more):
-    done, installs = set_up(configured=report(wheel, CUDA), index=report(wheel), **more)
-    assert done.returncode == 0, done.stderr
-    assert f"--index-url {INDEX}" in installs[0] and "--index-url" not in installs[1]
-
-
-@pytest.mark.parametrize("more", [{}, {"gpu": True}], ids=["no other build", "beside a GPU"])
-def test_setup_takes_a_cuda_build_and_reports_its_size(set_up, wheel, more):
-    wheel.write_bytes(b"")
+@pytest.mark.parametrize(("needs", "around", "own_index", "told"), CASES.values(), ids=CASES)
+def test_setup_chooses_a_build_of_torch(set_up, tmp_path, needs, around, own_index, told):
+    wheel, around = tmp_path / "torch.whl", dict(around)
+    wheel.touch()
     os.truncate(wheel, 2_300_000_000)  # a sparse file: it takes no space
-    done, installs = set_up(configured=report(wheel, CUDA), index=report(wheel) if more else None, **more)
-    assert done.returncode == 0, done.stderr
-    assert "2.3 GB" in done.stdout and "--index-url" not in installs[0]
-
-
-@pytest.mark.parametrize("given", [{"installed": True}, {"TORCHGRASP_CUDA": "1"}], ids=["installed", "asked for"])
-def test_setup_accepts_a_torch_that_is_installed_or_asked_for(set_up, wheel, given):
-    done, installs = set_up(configured=report(wheel, CUDA), index=report(wheel), **given)
-    assert done.returncode == 0, done.stderr
-    assert "--index-url" not in installs[0] and "CUDA" not in done.stdout
+    index = report(wheel) if around.pop("own", False) else None
+    done, installs = set_up(configured=report(wheel, *needs), index=index, **around)
+    assert done.returncode == 0 and told in done.stdout and ("GB" in done.stdout) is ("GB" in told), done.stderr
+    assert (f"--index-url {INDEX}" in installs[0]) is own_index and "torch==" in installs[0]
+    assert "--index-url" not in installs[1] and "-e .[sim,mujoco,cluster,dev,docs]" in installs[1]
+    done, installs = set_up()  # a second run does nothing
+    assert done.returncode == 0 and installs == [] and done.stdout == ""
 
 
 def test_setup_names_a_missing_torch(set_up):
     done, installs = set_up()
-    assert done.returncode == 1 and installs == []
-    assert "pip finds no torch==" in done.stderr
+    assert done.returncode == 1 and installs == [] and "pip finds no torch==" in done.stderr
