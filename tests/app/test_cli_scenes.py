@@ -1,6 +1,7 @@
 """`torchgrasp grasp` on scenes: what is taken, and one sentence for each bad input."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,12 @@ import trimesh
 from PIL import Image
 
 from torchgrasp import Status, load_grasps
+from torchgrasp.app.cli.grasps import Grasp
+from torchgrasp.app.cli.inputs import CloudOptions
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.planner import ScenePlan, ThingPlan
 from torchgrasp.scene import read_scene
+from torchgrasp.scene import Scene
 
 CAMERA = look_at(20.0, 45.0, 0.7)
 
@@ -86,6 +90,16 @@ def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, gr
         code, words = grasp(seen, "--fingers", wanted)
         assert asked.pop() == (("f3", "f1", "f2") if "," in wanted else ("f1", "f2", "f3"), passed)
     assert code == 1 and "object 2" in words and "too heavy" in words and "no executable grasp of any object" in words
+
+
+def test_a_scene_takes_another_table_and_keeps_its_target(seen):
+    scene = Scene.from_depth(*(seen[name] for name in ("depth", "intrinsics", "camera_pose")), mask=seen["labels"] == 2)
+    for view in (CloudOptions(table=(0.001,)), CloudOptions(up=(0.0, 0.1, 1.0))):
+        again = Grasp(cloud=Path("scene.npz"), view=view)._with_table(scene)
+        assert again.target == 1 and float(again.table.normal[2]) > 0.99
+        own, found = ({tuple(p) for p in s.pixels[s.rows_of()].tolist()} for s in (scene, again))
+        assert len(own & found) > 0.9 * len(own)
+    assert Grasp(cloud=Path("scene.npz"))._with_table(scene) is scene
 
 
 BAD = {

@@ -5,6 +5,8 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import torch
+
 from torchgrasp.app.cli.command import Command, Progress, arguments, naming, nested, option, positional
 from torchgrasp.app.cli.inputs import (
     CLOUD_HELP,
@@ -43,7 +45,7 @@ from torchgrasp.scene import Scene, read_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, TrialSpec
-from torchgrasp.values import format_success
+from torchgrasp.values import PointCloud, format_success
 
 if TYPE_CHECKING:
     import trimesh
@@ -106,8 +108,9 @@ class Grasp(Command):
         if scene:
             if self.label is not None and self.point is not None:
                 raise BadArgument("--point", "--label beside it", "one of the two")
-            if self.mesh or self.view != CloudOptions() or self.mode != "joint" or self.time_budget:
-                options = "--label or --point, --hand, --fingers, --out, --seed, --starts, --friction"
+            other = dataclasses.replace(self.view, table=None, up=None) != CloudOptions()
+            if self.mesh or other or self.mode != "joint" or self.time_budget:
+                options = "--label or --point, --table, --up, --hand, --fingers, --out, --seed, --starts, --friction"
                 raise BadArgument("CLOUD", "an option of clouds beside a scene", options)
         elif self.label is not None or self.point is not None:
             wanted = "a .npz file with depth and intrinsics"
@@ -172,6 +175,8 @@ class Grasp(Command):
         names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
         with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
             scene = read_scene(path)
+        with naming(table="--table", up="--up", target="--label", point="--point"):
+            scene = self._with_table(scene)
             scene = scene if choice is None else scene.select(choice)
         progress = Progress("scene", *["fingers"] * (among is not None), *STAGES, "report")
         with progress.bar, holding("--out", out):
@@ -196,6 +201,17 @@ class Grasp(Command):
             run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, None, None, scene, explanation)
             progress.end("report", write_results(out, run, self.no_report))
         return 0 if print_grasps(run) else 1
+
+    def _with_table(self, scene: Scene) -> Scene:
+        """Return a scene read anew with the table of --table or --up; a target that was chosen stays the target."""
+        if self.view.table is None and self.view.up is None:
+            return scene
+        table = None if self.view.table is None else self.view.plane(PointCloud(scene.points))
+        up, mask, image = None if table is not None else self.view.vertical, None, scene.image
+        if scene.target is not None:
+            mask = torch.zeros(image.depth.shape, dtype=torch.bool)
+            mask[tuple(scene.pixels[scene.rows_of()].T)] = True
+        return Scene.from_depth(image.depth, image.intrinsics, image.obj_from_camera, mask=mask, table=table, up=up)
 
     def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):
         """Plan for the objects of a scene until one is easy; return the scene with this target, grasps and shape."""
