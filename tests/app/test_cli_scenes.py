@@ -8,14 +8,13 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from scipy.ndimage import binary_dilation
 
-from torchgrasp import Status, load_grasps
-from torchgrasp.app.cli.grasps import Grasp
-from torchgrasp.app.cli.inputs import CloudOptions
+from torchgrasp import Status, load_grasps, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.errors import BadArgument
 from torchgrasp.planner import ScenePlan, ThingPlan
-from torchgrasp.scene import read_scene
-from torchgrasp.scene import Scene
+from torchgrasp.scene import Scene, read_scene
 
 CAMERA = look_at(20.0, 45.0, 0.7)
 
@@ -92,14 +91,97 @@ def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, gr
     assert code == 1 and "object 2" in words and "too heavy" in words and "no executable grasp of any object" in words
 
 
-def test_a_scene_takes_another_table_and_keeps_its_target(seen):
-    scene = Scene.from_depth(*(seen[name] for name in ("depth", "intrinsics", "camera_pose")), mask=seen["labels"] == 2)
-    for view in (CloudOptions(table=(0.001,)), CloudOptions(up=(0.0, 0.1, 1.0))):
-        again = Grasp(cloud=Path("scene.npz"), view=view)._with_table(scene)
-        assert again.target == 1 and float(again.table.normal[2]) > 0.99
-        own, found = ({tuple(p) for p in s.pixels[s.rows_of()].tolist()} for s in (scene, again))
-        assert len(own & found) > 0.9 * len(own)
-    assert Grasp(cloud=Path("scene.npz"))._with_table(scene) is scene
+def write(path: Path, seen: dict[str, np.ndarray], table: float, **choice: object) -> Scene:
+    """Write a scene on a wrong table, with a target or labels; return the scene."""
+    images = (seen[name] for name in ("depth", "intrinsics", "camera_pose"))
+    scene = Scene.from_depth(*images, table=table, **choice)
+    save_scene(scene, path)
+    return scene
+
+
+@pytest.fixture
+def planned(monkeypatch):
+    """Return the list of scenes that `torchgrasp grasp` plans; nothing is planned."""
+    scenes = []
+
+    def note(scene, *_, **__):
+        scenes.append(scene)
+        raise BadArgument("stop", "a scene", "none")
+
+    for name in ("plan_grasps", "plan_scene"):
+        monkeypatch.setattr(f"torchgrasp.app.cli.grasps.{name}", note)
+    return scenes
+
+
+def image_of(scene: Scene) -> np.ndarray:
+    """Return the label of each pixel of a scene."""
+    labels = np.zeros(scene.image.depth.shape, dtype=int)
+    labels[tuple(scene.pixels.numpy().T)] = scene.labels.numpy()
+    return labels
+
+
+@pytest.fixture
+def grasp_on(tmp_path, run_command):
+    """Return a function that runs the command on a scene with more options, and returns its words."""
+
+    def run(*options: str) -> str:
+        code, out, err = run_command(
+            "grasp", tmp_path / "s.npz", "--hand", "barrett", "--out", tmp_path / "o", *options
+        )
+        assert code == 2
+        return out + err
+
+    return run
+
+
+@pytest.mark.parametrize("options", [("--table", "0.001"), ("--up", "0", "0.1", "1")])
+def test_objects_that_the_library_found_are_found_again_on_another_table(seen, tmp_path, planned, grasp_on, options):
+    scene = write(tmp_path / "s.npz", seen, 0.03, point=[int(x) for x in middle(seen["labels"], 2)])
+    assert "found again" in grasp_on(*options)
+    (again,) = planned
+    assert again.given == () and again.target == scene.target
+    assert set(again.things) == {1, 2} and abs(again.table.offset) < 0.005
+    before, after = image_of(scene) == scene.target, image_of(again) == scene.target
+    assert (before & after).sum() > 0.95 * before.sum() and after.sum() > 1.2 * before.sum()  # down to the table
+
+
+def test_beside_a_mask_of_the_user_other_objects_are_found_again(seen, tmp_path, planned, grasp_on):
+    scene = write(tmp_path / "s.npz", seen, 0.03, mask=seen["labels"] == 2)
+    words = grasp_on("--table", "0.0")
+    assert "objects 1 are as given" in words and "objects 2 are found again" in words
+    before, after = image_of(scene), image_of(planned[0])
+    for label in (1, 2):  # down to the table
+        assert (
+            not ((before == label) & (after != label)).any() and (after == label).sum() > 1.2 * (before == label).sum()
+        )
+
+
+@pytest.mark.parametrize("form", ["mask", "labels"])
+def test_what_the_user_gave_only_loses_the_pixels_of_another_table(seen, tmp_path, planned, grasp_on, form):
+    column = int(np.nonzero(seen["labels"] == 2)[1].mean())
+    box, own = seen["labels"] == 2, binary_dilation(seen["labels"] == 2, iterations=12)
+    box[:, :column], own[:, :column] = False, False  # half of a box: no segmentation finds it
+    scene = write(tmp_path / "s.npz", seen, -0.03, **{form: own if form == "mask" else 7 * own})
+    label = 1 if form == "mask" else 7
+    assert scene.given == (label,) and (image_of(scene) == label).sum() > 1.2 * box.sum()  # with a strip of the table
+    assert f"objects {label} are as given" in grasp_on("--table", "0.0")
+    (again,) = planned
+    assert again.given == (label,) and again.target == (1 if form == "mask" else None)
+    assert again.things == (label,)
+    before, kept = image_of(scene) == label, image_of(again) == label
+    high = before & box & (again.table.height(again.image.points()).numpy() > 0.01)
+    assert (kept & high).sum() > 0.99 * high.sum() and kept[~binary_dilation(box, iterations=2)].sum() < 5
+
+
+def test_a_target_that_is_lost_on_another_table_is_told(seen, tmp_path, planned, grasp_on):
+    around = binary_dilation(seen["labels"] > 0, iterations=40).astype(int)  # an older file with boxes and table as one
+    np.savez(tmp_path / "s.npz", **seen | {"labels": around, "table": [0, 0, 1, -0.03], "target": 1})
+    error = grasp_on("--table", "0.0")
+    assert error.startswith("torchgrasp: --table: ") and "object 1, the target, is lost" in error and not planned
+    grasp_on("--table", "0.0", "--point", *middle(seen["labels"], 1))
+    assert [scene.target in (2, 3) for scene in planned] == [True]
+    write(tmp_path / "s.npz", seen, -0.03, labels=around - binary_dilation(seen["labels"] > 0, iterations=9))
+    assert "every object is lost" in grasp_on("--table", "0.0")
 
 
 BAD = {

@@ -20,7 +20,8 @@ def read_scene(path: Path | str) -> Scene:
     """Read a scene from a .npz file, as `Scene.from_depth` does.
 
     It has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are `camera_pose` (4, 4), `labels`
-    or a `mask` of the target (h, w), the label `target`, and `table` (4,): normal and offset.
+    or a `mask` of the target (h, w), the label `target`, `table` (4,): normal and offset, and `given`: the labels that
+    are the user's. Without it, labels are the user's, unless there is a table, as in scenes that the library saved.
 
     Raises:
         CloudFileError: no such file, or malformed content.
@@ -34,11 +35,14 @@ def read_scene(path: Path | str) -> Scene:
     arrays = read_arrays(Path(path))
     table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
     others, bounded = arrays.pop("others", np.empty((0, 4))), bool(arrays.pop("bounded", True))
+    given = arrays.pop("given", [] if table is not None and "labels" in arrays else None)
     plane, *rest = (
         (Plane(torch.tensor(row[:3]), float(row[3])) for row in [table, *others]) if table is not None else [None]
     )
     scene = Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
-    scene = dataclasses.replace(scene, others=tuple(rest), image=dataclasses.replace(scene.image, bounded=bounded))
+    own = scene.given if given is None else tuple(label for label in scene.things if label in given)
+    image = dataclasses.replace(scene.image, bounded=bounded)
+    scene = dataclasses.replace(scene, image=image, others=(*rest, *scene.others), given=own)
     return scene if target is None else scene.select(int(target))
 
 
@@ -65,6 +69,7 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
         "intrinsics": scene.image.intrinsics.cpu().numpy(),
         "camera_pose": scene.image.obj_from_camera.cpu().numpy(),
         "labels": labels,
+        "given": np.array(scene.given, dtype=np.int64),
         "bounded": np.array(scene.image.bounded),
     }
     if scene.table is not None:

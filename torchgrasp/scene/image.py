@@ -142,6 +142,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         "depth_unit": (float, ()),
         "target": (np.int64, ()),
         "bounded": (bool, ()),
+        "given": (np.int64, -1),
     }
     names = ("depth", "intrinsics", "camera_pose", "labels", "mask", *typed)
     allowed = "a .npz file with depth and intrinsics"

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support
 from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
 from torchgrasp.scene.segment import count_labels, on_surface, segment
@@ -170,17 +171,51 @@ def label_image(
         found = f"{int(target.sum())} of {seen} measured pixels above the table"
         least = f"at least {LEAST_PIXELS}, and a {1 / MASK_SHARE:.0f}th: this target is the table"
         raise BadArgument("mask", found, least)
-    from scipy.ndimage import binary_dilation
-
-    about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
-    rest = torch.where(target | (about & belongs[objects]), 0, objects)
-    few = count_labels(rest, length) < LEAST_PIXELS
-    rest = torch.where(few[rest], 0, rest)
+    rest = _beside(objects, target, mask, belongs)
     _, number = torch.cat([torch.zeros(1, dtype=torch.long), rest.reshape(-1)]).unique(return_inverse=True)
     rest = number[1:].reshape(rest.shape)
     low, strips = mask & ~inside & _on_support(image, support), inside & ~target
     notes = [*_removed("mask", int(low.sum()), seen), *_removed("mask", int(strips.sum()), seen, "another object")]
     return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0)), tuple(notes)
+
+
+def label_again(
+    image: DepthImage, former: Plane, support: Support, labels: Int[Tensor, "h w"], given: tuple[int, ...], first: int
+) -> Int[Tensor, "h w"]:
+    """Return the label of each pixel on another support than the former table.
+
+    Labels that the user gave lose pixels on the support, and get those of their objects that the former table hid.
+    Other objects are found again: an object has the label of most of its former pixels, the label `first` first.
+    """
+    own = torch.isin(labels, torch.tensor(given, dtype=torch.long))
+    kept = torch.where(own & on_surface(image, support.plane), labels, 0)
+    found, seen = segment(image, support), on_surface(image, former)
+    width, (names, row) = int(found.max()) + 1, labels.unique(return_inverse=True)
+    shared = count_labels((row * width + found)[seen], len(names) * width).reshape(len(names), width)
+    shared[:, 0] = 0
+    number, belongs = torch.arange(width) + names[-1], torch.zeros(width, dtype=torch.bool)
+    for k in sorted(range(len(names)), key=lambda k: int(names[k]) != first):
+        if int(names[k]) in given:
+            mine = 2 * shared[k] > shared.sum(0)
+            kept = torch.where(~seen & mine[found] & (kept == 0), names[k], kept)
+            belongs |= mine
+        elif names[k] > 0 and 2 * int(shared[k].max()) > int((labels == names[k]).sum()):
+            best = shared[k].argmax()
+            number[best] = torch.where(number[best] > names[-1], names[k], number[best])
+    if bool(own.any()) and not bool((labels[~own] > 0).any()):
+        return kept
+    found = _beside(found, kept > 0, own, belongs)
+    return torch.where(kept > 0, kept, torch.where(found > 0, number[found], 0))
+
+
+def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> Int[Tensor, "h w"]:
+    """Return the objects without the target, and without strips about its mask of objects that belong to it."""
+    from scipy.ndimage import binary_dilation
+
+    about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
+    rest = torch.where(target | (about & belongs[objects]), 0, objects)
+    few = count_labels(rest, len(belongs)) < LEAST_PIXELS
+    return torch.where(few[rest], 0, rest)
 
 
 def _on_support(image: DepthImage, support: Support) -> Bool[Tensor, "h w"]:

@@ -36,6 +36,7 @@ class Scene(Value):
         target: label of the object to be grasped; None: not chosen.
         others: other planes that objects could stand on, the more plausible first.
         notes: what was removed of given masks or labels, a sentence each.
+        given: labels whose pixels the user gave, as labels or as a mask; the library found the other objects.
 
     >>> from torchgrasp import load_scene
     >>> target = load_scene().select([394, 312])  # a clicked pixel: column, row
@@ -51,6 +52,7 @@ class Scene(Value):
     target: int | None = None
     others: tuple[Plane, ...] = ()
     notes: tuple[str, ...] = ()
+    given: tuple[int, ...] = ()
 
     @classmethod
     @checked
@@ -99,11 +101,10 @@ class Scene(Value):
         found, notes = label_image(image, supports[0], given, inside)
         if table is None and depth_unit is None:
             check_sizes(points[measured], found[measured], image.obj_from_camera[:3, 3], supports[0].plane)
+        planes, pixels = tuple(support.plane for support in supports), torch.nonzero(measured)
         target = None if mask is None else 1
-        planes = tuple(support.plane for support in supports)
-        scene = cls(
-            points[measured], found[measured], image, torch.nonzero(measured), planes[0], target, planes[1:], notes
-        )
+        scene = cls(points[measured], found[measured], image, pixels, planes[0], target, planes[1:], notes)
+        scene = dataclasses.replace(scene, given=scene.things if given is not None else () if inside is None else (1,))
         return scene if point is None else scene.select(point)
 
     @classmethod
@@ -169,7 +170,9 @@ class Scene(Value):
 
         found, notes = label_image(image, supports[0], to_image(given), to_image(inside))
         own = torch.where(front, found[row, column], 0)
-        scene = cls(points, own, image, pixels, planes[0], None if inside is None else 1, planes[1:], notes)
+        target = None if inside is None else 1
+        scene = cls(points, own, image, pixels, planes[0], target, planes[1:], notes)
+        scene = dataclasses.replace(scene, given=scene.things if given is not None else () if inside is None else (1,))
         return scene if point is None else scene.select(point)
 
     @checked

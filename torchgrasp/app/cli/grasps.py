@@ -28,6 +28,7 @@ from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.checks import Count, Seed
 from torchgrasp.cloud.agreement import check_mesh, check_stand
+from torchgrasp.cloud.pose import find_plausible
 from torchgrasp.data.shipped import DATA, MASSES, list_objects, load_object
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.lift import close_hand
@@ -43,6 +44,7 @@ from torchgrasp.planner.problem import take_target
 from torchgrasp.planner.scene import plan_scene
 from torchgrasp.scene import Scene, read_scene
 from torchgrasp.scene.image import is_scene
+from torchgrasp.scene.masks import label_again
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, TrialSpec
 from torchgrasp.values import PointCloud, format_success
@@ -108,7 +110,7 @@ class Grasp(Command):
         if scene:
             if self.label is not None and self.point is not None:
                 raise BadArgument("--point", "--label beside it", "one of the two")
-            other = dataclasses.replace(self.view, table=None, up=None) != CloudOptions()
+            other = vars(self.view) | {"table": None, "up": None} != vars(CloudOptions())
             if self.mesh or other or self.mode != "joint" or self.time_budget:
                 options = "--label or --point, --table, --up, --hand, --fingers, --out, --seed, --starts, --friction"
                 raise BadArgument("CLOUD", "an option of clouds beside a scene", options)
@@ -124,8 +126,7 @@ class Grasp(Command):
         file = self.view.read("CLOUD", path)
         view = self.view.with_table_of(file)
         cloud, table = file.cloud, view.plane(file.cloud)
-        make = ContactSpec.paper if self.mode == "paper" else ContactSpec
-        spec, trial = make(friction=self.friction, table=table), TrialSpec(friction=self.friction)
+        spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(friction=self.friction, table=table)
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
@@ -150,9 +151,8 @@ class Grasp(Command):
             run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, explanation=explanation)
             if self.close and true_mesh is not None and len(run.executable):
                 felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
-                closure = close_hand(
-                    run.executable[0], hand, true_mesh, trial, seed=self.seed, parts=parts, surface=felt
-                )
+                trial, options = TrialSpec(friction=self.friction), {"parts": parts, "surface": felt}
+                closure = close_hand(run.executable[0], hand, true_mesh, trial, seed=self.seed, **options)
                 progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
                 run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
             progress.end("report", write_results(out, run, self.no_report))
@@ -163,9 +163,9 @@ class Grasp(Command):
         """Return the path of the true mesh for the simulated closing; None: no closing."""
         shipped = path != self.cloud  # the cloud is given by name
         mesh = path.with_name("mesh.ply") if shipped and self.close and self.mesh is None else self.mesh
-        if self.close and mesh is None:
-            raise BadArgument("--close", "no --mesh", "--close together with --mesh")
         if self.close:
+            if mesh is None:
+                raise BadArgument("--close", "no --mesh", "--close together with --mesh")
             import_simulator()
         return mesh
 
@@ -176,7 +176,7 @@ class Grasp(Command):
         with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
             scene = read_scene(path)
         with naming(table="--table", up="--up", target="--label", point="--point"):
-            scene = self._with_table(scene)
+            scene = self._with_table(scene, choice is not None)
             scene = scene if choice is None else scene.select(choice)
         progress = Progress("scene", *["fingers"] * (among is not None), *STAGES, "report")
         with progress.bar, holding("--out", out):
@@ -202,16 +202,27 @@ class Grasp(Command):
             progress.end("report", write_results(out, run, self.no_report))
         return 0 if print_grasps(run) else 1
 
-    def _with_table(self, scene: Scene) -> Scene:
-        """Return a scene read anew with the table of --table or --up; a target that was chosen stays the target."""
-        if self.view.table is None and self.view.up is None:
+    def _with_table(self, scene: Scene, chosen: bool) -> Scene:
+        """Return a scene on the table of --table or --up; a target that is lost needs another one to be chosen."""
+        if (self.view.table is None and self.view.up is None) or scene.table is None:
             return scene
+        image, name = scene.image, "--up" if self.view.table is None else "--table"
         table = None if self.view.table is None else self.view.plane(PointCloud(scene.points))
-        up, mask, image = None if table is not None else self.view.vertical, None, scene.image
-        if scene.target is not None:
-            mask = torch.zeros(image.depth.shape, dtype=torch.bool)
-            mask[tuple(scene.pixels[scene.rows_of()].T)] = True
-        return Scene.from_depth(image.depth, image.intrinsics, image.obj_from_camera, mask=mask, table=table, up=up)
+        supports = find_plausible(scene.points, image.obj_from_camera, table, self.view.vertical, known_unit=True)
+        labels = torch.zeros(image.depth.shape, dtype=torch.long)
+        labels[tuple(scene.pixels.T)] = scene.labels
+        labels = label_again(image, scene.table, supports[0], labels, scene.given, scene.target or 0)
+        labels = labels[tuple(scene.pixels.T)]
+        planes, target = tuple(support.plane for support in supports), None if chosen else scene.target
+        again = dataclasses.replace(scene, labels=labels, table=planes[0], others=planes[1:], target=target)
+        if not again.things or target not in (None, *again.things):
+            lost = f"object {target}, the target," if again.things else "every object"
+            wanted = "one that keeps the target, or another target by --label or --point"
+            raise BadArgument(name, f"a table ({planes[0].describe()}) with which {lost} is lost", wanted)
+        kept, found = (", ".join(str(k) for k in again.things if (k in scene.given) is own) for own in (True, False))
+        said = [f"objects {kept} are as given, but for pixels of the table"] * bool(kept)
+        print_notes(("; ".join(said + [f"objects {found} are found again on this table"] * bool(found)),))
+        return again
 
     def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):
         """Plan for the objects of a scene until one is easy; return the scene with this target, grasps and shape."""
