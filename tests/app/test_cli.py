@@ -196,11 +196,7 @@ def test_grasp_writes_grasps_and_pages_for_a_shipped_object_by_name(tmp_path, ru
 
 @pytest.mark.parametrize(
     ("words", "near"),
-    [
-        (["gras", "x"], "grasp"),
-        (["grasp", "jgu"], "jug"),
-        (["grasp", "jug", "--hand", "alegro"], "allegro"),
-    ],
+    [(["gras", "x"], "grasp"), (["grasp", "jgu"], "jug"), (["grasp", "jug", "--hand", "alegro"], "allegro")],
 )
 def test_a_misspelt_name_is_answered_with_the_nearest_one(words, near, tmp_path, monkeypatch, refusal, refuse_work):
     monkeypatch.chdir(tmp_path)

@@ -73,13 +73,7 @@ def test_neighbours_are_drawn_and_the_target_is_not_drawn_twice(run, scene):
 
 
 def test_a_run_in_a_scene_shows_it_first(run, scene, monkeypatch):
-    for name in (
-        "draw_cloud",
-        "draw_surface",
-        "draw_contacts",
-        "draw_grasp",
-        "draw_film",
-    ):
+    for name in ("draw_cloud", "draw_surface", "draw_contacts", "draw_grasp", "draw_film"):
         monkeypatch.setattr(f"torchgrasp.app.report.page.{name}", lambda *a: b"")
     monkeypatch.setattr("torchgrasp.app.report.page.draw_among", lambda *a: b"")
     sections = draw_pictures(dataclasses.replace(run, scene=scene))
