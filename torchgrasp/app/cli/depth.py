@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from torchgrasp.app.cli.command import Command, arguments, option, positional, required
 from torchgrasp.app.cli.inputs import OUT_CLOUD_HELP, ViewOptions, read_table
@@ -149,8 +149,8 @@ class CloudScene(_DepthCommand):
                 raise BadArgument(f"--{name}", "an option of depth images beside a cloud", "--point X Y Z, or --unit")
         if self.point is not None and len(self.point) != 3:
             raise BadArgument("--point", f"{len(self.point)} numbers", "x y z [m] of a point in the cloud")
-        view = ViewOptions(viewpoint=self.viewpoint, unit=self.unit, camera_pose=self.camera_pose)
-        file = view.read("DEPTH", self.depth, whole=True)
+        given: Any = {"viewpoint": self.viewpoint, "unit": self.unit, "camera_pose": self.camera_pose}
+        file = ViewOptions(**given).read("DEPTH", self.depth, whole=True)
         table = file.table if self.table is None else read_table(self.table)
         seen = Scene.from_cloud(file.cloud, point=self.point, table=table, up=self.up)
         return dataclasses.replace(seen, notes=(*file.notes, *seen.notes))

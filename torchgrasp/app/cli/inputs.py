@@ -1,7 +1,6 @@
 """Arguments that several commands share: reading of cloud files, the table, the hand, and output folders."""
 
 import contextlib
-import dataclasses
 import importlib
 import importlib.util
 import re
@@ -10,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -107,7 +106,8 @@ class CloudOptions(ViewOptions):
         """Return the options with the table that a file holds, unless the user gave one or none."""
         if file.table is None or self.table is not None or self.no_table:
             return self
-        return dataclasses.replace(self, table=(*file.table.components, file.table.offset))
+        known: Any = {**vars(self), "table": (*file.table.components, file.table.offset)}
+        return CloudOptions(**known)
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
         """Return the table as a plane, as a height [m] along z, or None."""
