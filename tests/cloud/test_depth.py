@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -93,6 +95,12 @@ REFUSED = {
     "the second camera's projection": (lambda d: (d, [600, 0, 31, -30, 0, 600, 24, 0, 0, 0, 1, 0]), "fourth column"),
     "a camera of twice the size": (lambda d: (d, camera(128, 96)), r"an image of 128 x 96 px.*|times 0\.5"),
     "a camera of another ratio": (lambda d: (d, camera(85, 48)), "an image of 85 x 48 px"),
+    "a region of another size": (
+        lambda d: (d, {"K": K.ravel().tolist(), "roi": {"x_offset": 0, "y_offset": 0, "width": 32, "height": 24}}),
+        "an image of 32 x 24 px",
+    ),
+    "a region of words": (lambda d: (d, {"K": K.ravel().tolist(), "roi": {"x_offset": "8"}}), "roi and binning"),
+    "a region that is a list": (lambda d: (d, camera(64, 48) | {"roi": [1], "binning_x": -1}), "roi and binning"),
     "a camera that is turned": (lambda d: (d, camera(48, 64)), "the transposed image"),
     "transposed intrinsics": (lambda d: (d, K.T), "intrinsics.*fx, fy"),
     "three intrinsics": (lambda d: (d, (600.0, 30.0, 20.0)), "intrinsics.*fx, fy, cx, cy"),
@@ -130,6 +138,28 @@ FORMS = {
     "twelve numbers": torch.cat([K, torch.zeros(3, 1)], 1).ravel(),
     "four numbers": (600, 550, 30, 20),
     "with the size": (600, 550, 30, 20, 64, 48),
+    "CameraInfo of a region": {
+        "K": (K + torch.tensor([[0, 0, 100], [0, 0, 50], [0, 0, 0]])).ravel().tolist(),
+        "width": 640,
+        "height": 480,
+        "roi": {"x_offset": 100, "y_offset": 50, "width": 64, "height": 48, "do_rectify": False},
+    },
+    "CameraInfo of binned pixels": {
+        "k": (torch.diag(torch.tensor([2.0, 2.0, 1.0]).double()) @ K).ravel().tolist(),
+        "width": 128,
+        "height": 96,
+        "binning_x": 2,
+        "binning_y": 2,
+        "roi": {"x_offset": 0, "y_offset": 0, "width": 0, "height": 0},
+    },
+    "message of a binned region": SimpleNamespace(
+        k=[1200.0, 0, 68, 0, 1100, 46, 0, 0, 1],
+        width=640,
+        height=480,
+        binning_x=2,
+        binning_y=2,
+        roi=SimpleNamespace(x_offset=8, y_offset=6, width=128, height=96),
+    ),
     "CameraInfo of ROS 1": {"K": K.ravel().tolist(), "width": 64, "height": 48, "D": [0.0] * 5},
     "message of ROS 2": Ros(),
     "calibration of ROS": {

@@ -27,6 +27,14 @@ def seen(view="front"):
     return render_depth(meshes, pose)[0], pose
 
 
+def rolled():
+    """Depth [m] by a camera that is rolled by ten degrees, and its pose."""
+    turn = rotation_from_vector(torch.tensor([0.0, 0.0, math.radians(10.0)]).double())
+    pose = seen()[1] @ rigid(turn, torch.zeros(3).double())
+    meshes = [box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))]
+    return render_depth(meshes, pose)[0], pose
+
+
 def scaled(pose, factor):
     return rigid(pose[:3, :3], factor * pose[:3, 3])
 
@@ -57,13 +65,30 @@ def test_a_wrong_pose_is_told_by_what_contradicts_it(name, view):
         Scene.from_depth(depth, INTRINSICS, POSES[name][0](pose))
 
 
-@pytest.mark.parametrize(
-    "name", ["transposed", "millimetres", "scaled", "left-handed", "rounded", "3 x 4", "a quaternion"]
-)
-def test_a_cloud_refuses_a_pose_that_is_no_pose(name):
+@pytest.mark.parametrize("name", POSES)
+def test_a_cloud_of_a_mask_is_told_the_same(name):
     depth, pose = seen()
+    near = (depth > 0) & (depth < 0.62)
+    assert len(cloud_from_depth(depth, INTRINSICS, near, pose)) == int(near.sum())
+    with pytest.raises(BadArgument, match=f"camera_pose: .*({POSES[name][1]})"):
+        cloud_from_depth(depth, INTRINSICS, near, POSES[name][0](pose))
+
+
+@pytest.mark.parametrize("elevation", [75.0, 80.0, 86.0])
+@pytest.mark.parametrize("name", ["inverse", "OpenGL's view matrix"])
+def test_an_inverse_pose_is_told_by_a_table_a_few_degrees_from_level(elevation, name):
+    pose = look_at(20.0, elevation, 0.7)
+    depth = render_depth([box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose)[0]
+    assert len(Scene.from_depth(depth, INTRINSICS, pose).things) == 2
     with pytest.raises(BadArgument, match=POSES[name][1]):
-        cloud_from_depth(depth, INTRINSICS, depth > 0, POSES[name][0](pose))
+        Scene.from_depth(depth, INTRINSICS, POSES[name][0](pose))
+    right_up = tuple(Scene.from_depth(depth, INTRINSICS, inverse(pose), table=None, up=_up(pose)).table.normal.tolist())
+    assert right_up[2] > 0.9  # whose user says so is believed
+
+
+def _up(pose):
+    """Return the table's normal under the inverse of a pose."""
+    return tuple((pose[:3, :3].T @ pose[:3, :3].T[:, 2]).tolist())
 
 
 INPUTS = {  # depth in metres and pose to the arguments; what is said
@@ -71,6 +96,19 @@ INPUTS = {  # depth in metres and pose to the arguments; what is said
     "tenths of a millimetre, posed": (
         lambda d, p: {"depth": np.uint16((1e4 * d).numpy()), "camera_pose": p},
         "depth_unit",
+    ),
+    "a quarter of a millimetre": (lambda d, p: {"depth": np.uint16((4e3 * d).numpy())}, "depth_unit"),
+    "a quarter of a millimetre, posed": (
+        lambda d, p: {"depth": np.uint16((4e3 * d).numpy()), "camera_pose": p},
+        "depth_unit",
+    ),
+    "a quarter of a millimetre, near": (
+        lambda d, p: {"depth": np.uint16((4e3 * 0.6 * d).numpy()), "camera_pose": scaled(p, 0.6)},
+        "depth_unit",
+    ),
+    "mirrored by a camera that is rolled": (
+        lambda d, p: {"depth": rolled()[0].flip(1), "camera_pose": rolled()[1]},
+        r"depth\[:, ::-1\]",
     ),
     "floating millimetres": (lambda d, p: {"depth": 1e3 * d}, "depth_unit=0.001"),
     "centimetres": (lambda d, p: {"depth": 100 * d}, "depth_unit=0.01"),
@@ -125,3 +163,17 @@ def test_right_poses_raise_no_alarm():
     assert len(Scene.from_depth(depth, INTRINSICS).things) == 2  # the camera's own frame
     beside = rigid(rotation_from_vector(torch.tensor([0.02, 0.0, 0.01]).double()), torch.tensor([0.015, 0, 0]).double())
     assert len(Scene.from_depth(depth, INTRINSICS, beside).things) == 2  # the frame of the colour camera
+
+
+def test_a_high_camera_is_noted_where_no_unit_is_given():
+    depth, pose = seen()
+    high = Scene.from_depth(2.2 * depth, INTRINSICS, scaled(pose, 2.2))  # objects of 11 to 22 cm
+    assert len(high.notes) == 1 and "1.09 m above the table" in high.notes[0] and "depth_unit" in high.notes[0]
+    assert Scene.from_depth(2.2 * depth, INTRINSICS, scaled(pose, 2.2), depth_unit=1.0).notes == ()
+    assert Scene.from_depth(depth, INTRINSICS, pose).notes == ()
+
+
+def test_a_mirrored_image_of_a_level_camera_is_a_right_image_of_another_scene():
+    depth, pose = seen()
+    mirrored = Scene.from_depth(depth.flip(1), INTRINSICS, pose)
+    assert len(mirrored.things) == 2 and abs(mirrored.table.offset) < 0.001

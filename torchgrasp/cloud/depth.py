@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.checks import Positive, check_tensor, checked
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
-from torchgrasp.cloud.pose import read_camera_pose
+from torchgrasp.cloud.pose import check_view, read_camera_pose
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
@@ -30,6 +30,7 @@ def cloud_from_depth(
     mask: Tensor | np.ndarray | None = None,
     camera_pose: Tensor | np.ndarray | None = None,
     depth_unit: Positive | None = None,
+    up: Sequence[float | int] | Tensor | np.ndarray | None = None,
 ) -> PointCloud:
     """Return the points of a pinhole camera's depth image.
 
@@ -46,10 +47,11 @@ def cloud_from_depth(
         mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None: all measured pixels.
         camera_pose: obj_from_camera (4, 4), rigid; None: the result is in the camera's frame.
         depth_unit: metres of one count of the depth, such as 0.00025; None: of the intrinsics, or as `depth` says.
+        up: (3,), against gravity in the frame of the pose, to which a table in the image is compared; None: z.
 
     Raises:
         BadArgument: depth that is negative or of another unit; intrinsics of another resolution; a mask of another size
-            or without pixels; a pose that is not rigid or is more than 100 m off.
+            or without pixels; a pose that is not rigid, is more than 100 m off, or turns a table in the image over.
         TooFewPoints: fewer than 4 measured pixels.
         SuspiciousScale: an extent outside [5 mm, 2 m], as of a scene without a mask.
 
@@ -61,16 +63,23 @@ def cloud_from_depth(
     if int(measured.sum()) < MIN_POINTS:
         allowed = f"at least {MIN_POINTS} measured pixels in the mask"
         raise TooFewPoints("depth", f"{int(measured.sum())} measured pixels", allowed)
-    row, column = torch.nonzero(measured, as_tuple=True)
-    z = z_image[measured]
-    points = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
-    viewpoint = torch.zeros(3, dtype=points.dtype, device=points.device)
-    frustum = frustum_of_image(k, z_image.shape).to(points)
+    points = _points(z_image, k, measured)
+    pose = (torch.eye(4) if camera_pose is None else read_camera_pose(camera_pose)).to(points)
+    if inside is not None:  # else the image may show the object alone, without a table
+        everything = apply(pose, _points(z_image, k, z_image > 0))
+        check_view(everything[:: 1 + len(everything) // 5000], pose.cpu(), up, depth_unit is not None)
+    viewpoint, frustum = pose[:3, 3], frustum_of_image(k, z_image.shape).to(points)
     if camera_pose is not None:
-        pose = read_camera_pose(camera_pose).to(points)
-        points, viewpoint, frustum = apply(pose, points), pose[:3, 3], rotate(pose, frustum)
+        points, frustum = apply(pose, points), rotate(pose, frustum)
     dtype = depth.dtype if isinstance(depth, Tensor) and depth.is_floating_point() else points.dtype
     return check_cloud(PointCloud(points.to(dtype), None, viewpoint.to(dtype), frustum.to(dtype)))
+
+
+def _points(z_image: Float[Tensor, "h w"], k: Float[Tensor, "3 3"], keep: Bool[Tensor, "h w"]) -> Float[Tensor, "n 3"]:
+    """Return the points [m] of pixels in the camera's frame."""
+    row, column = torch.nonzero(keep, as_tuple=True)
+    z = z_image[keep]
+    return torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
 
 
 def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> Float[Tensor, "4 3"]:
@@ -142,11 +151,11 @@ def _in_metres(image: Tensor, unit: float | None) -> Float[Tensor, "h w"]:
     return torch.where(metres <= MAX_DEPTH, metres, 0.0)
 
 
-def _read_forms(value: object) -> tuple[Any, list[float] | None, float | None]:
-    """Return numbers of intrinsics, their [width, height], and metres of a count, from any form of a camera's file."""
+def _read_forms(value: object) -> tuple[Any, list[float] | None, float | None, list[float]]:
+    """Return numbers of intrinsics, their [width, height], metres of a count, and ROS's window, from any form."""
     if isinstance(value, Tensor | np.ndarray | Sequence) and not isinstance(value, str):
-        return value, None, None
-    names = (*MATRICES, "K", "fx", "fy", "cx", "cy", "ppx", "ppy", "width", "height")
+        return value, None, None, []
+    names = (*MATRICES, "K", "fx", "fy", "cx", "cy", "ppx", "ppy", "width", "height", "roi", "binning_x", "binning_y")
     inner: Any = value if isinstance(value, Mapping) else {n: getattr(value, n) for n in names if hasattr(value, n)}
     named, key = dict[str, Any](), ""
     for _ in range(4):  # ROS and Zivid write a matrix as an object
@@ -170,7 +179,17 @@ def _read_forms(value: object) -> tuple[Any, list[float] | None, float | None]:
             raise BadArgument("intrinsics", f"{name} = {str(x)[:60]!r}", f"a positive {name}")
     if scale is not None:  # Open3D's counts of a metre; metres of a count, or of BOP millimetres
         scale = 1 / scale if key == "intrinsic_matrix" else scale if "ppx" in named else scale / 1000
-    return inner, None if width is None or height is None else [float(width), float(height)], scale
+    return inner, None if width is None or height is None else [float(width), float(height)], scale, _window(named)
+
+
+def _window(named: Mapping[str, Any]) -> list[float]:
+    """Return corner, width and height of ROS's region of interest [px], and its binning; 0: all of the image, or 1."""
+    roi, sides = named.get("roi", {}), ("x_offset", "y_offset", "width", "height")
+    found: list[Any] = [roi.get(side, 0) if isinstance(roi, Mapping) else getattr(roi, side, 0) for side in sides]
+    found += [named.get("binning_x", 0), named.get("binning_y", 0)]
+    if not _is_table(found) or not all(0 <= number < 1e6 for number in found):
+        raise BadArgument("intrinsics", f"roi and binning {str(found)[:80]}", "numbers of pixels >= 0")
+    return [float(number) for number in found]
 
 
 def _is_table(value: object) -> bool:
@@ -184,7 +203,7 @@ def _is_table(value: object) -> bool:
 
 def _read_intrinsics(value: object) -> tuple[Float[Tensor, "3 3"], list[float] | None, float | None]:
     """Return the matrix of intrinsics [px], their [width, height], and metres of a count; or refuse them."""
-    value, stated, scale = _read_forms(value)
+    value, stated, scale, window = _read_forms(value)
     k, allowed = _as_tensor("intrinsics", value), "(fx, fy, cx, cy), or a 3 x 3 matrix"
     k = k if k.is_complex() else k.double()
     if k.ndim == 1 and len(k) in (9, 12):
@@ -202,6 +221,12 @@ def _read_intrinsics(value: object) -> tuple[Float[Tensor, "3 3"], list[float] |
         turned = bool(k[2, :2].any()) and not bool(k[:2, 2].any())
         allowed = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0" + ", the transpose" * turned
         raise BadArgument("intrinsics", k.tolist(), allowed)
+    if any(window):  # of ROS, whose matrix is that of the whole sensor
+        corner, size, bins = k.new_tensor(window).reshape(3, 2)
+        bins = bins.clamp_min(1)
+        k = torch.cat([torch.cat([k[:2, :2], k[:2, 2:] - corner[:, None]], 1) / bins[:, None], k[2:]])
+        size = torch.where(size > 0, size, torch.tensor(stated or [0.0, 0.0]).to(size)) / bins
+        stated = size.floor().tolist() if bool(size.all()) else stated
     return k, stated, scale
 
 

@@ -93,7 +93,6 @@ def find_plausible(
         known_unit: whether the user stated the unit of the depth.
     """
     eye = pose[:3, 3]
-    own = float(torch.diagonal(pose[:3, :3]).min()) > 0.985 and float(torch.linalg.vector_norm(eye)) < 0.1
     try:
         supports = find_table(points, eye, table, up)
     except NoSupport:
@@ -101,28 +100,48 @@ def find_plausible(
         if table is None and not 0.15 < middle < 4.0:
             found = f"a median depth of {middle:.3g} m, and no table"
             raise BadArgument("depth", found, UNIT) from None
-        if up is not None and table is None and not own:
+        if up is not None and table is None and not _is_own(pose):
             with contextlib.suppress(NoSupport):
                 _check_normals(find_table(points, eye, None, None), pose, up)
         raise
-    plane = supports[0].plane
-    if table is not None:
-        _check_given_table(points, plane)
-        return supports
-    if not own:
-        _check_normals(supports, pose, up)
-        check_distance(pose, plane.offset, 10.0, "a table")
-    if float(plane.height(eye)) > (10.0 if known_unit else 4.0):
-        found = f"a camera {float(plane.height(eye)):.3g} m above the table"
-        raise BadArgument("depth", found, UNIT)
+    if table is None:
+        _check_supports(supports, pose, up, known_unit)
+    else:
+        _check_given_table(points, supports[0].plane)
     return supports
 
 
+def check_view(points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
+    """Refuse a pose or a unit that a support in the view contradicts; see `find_plausible`."""
+    with contextlib.suppress(NoSupport):
+        _check_supports(find_table(points, pose[:3, 3], None, None), pose, up, known_unit)
+
+
+def _is_own(pose: Float[Tensor, "4 4"]) -> bool:
+    """Return whether a pose is nearly the identity: in the camera's frame any direction may be up."""
+    return float(torch.diagonal(pose[:3, :3]).min()) > 0.985 and float(torch.linalg.vector_norm(pose[:3, 3])) < 0.1
+
+
+def _check_supports(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
+    """Refuse a pose that contradicts the supports, and a camera that is too high above the first."""
+    plane = supports[0].plane
+    if not _is_own(pose):
+        _check_normals(supports, pose, up)
+        check_distance(pose, plane.offset, 10.0, "a table")
+    height = float(plane.height(pose[:3, 3]))
+    if height > (10.0 if known_unit else 4.0):
+        raise BadArgument("depth", f"a camera {height:.3g} m above the table", UNIT)
+
+
 def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up: object) -> None:
-    """Refuse a pose that turns the table over, or one that another convention would make upright."""
+    """Refuse a pose that turns the table over, or one that another convention would make upright.
+
+    A table up to 15 degrees from level may be one of a tilted frame, unless another convention makes it level.
+    """
     sky = torch.tensor([0.0, 0.0, 1.0]).double() if up is None else unit(torch.as_tensor(up).double().cpu())
     normals = torch.stack([support.plane.normal.double() for support in supports])
-    if float((normals @ sky).max()) > math.cos(math.radians(15.0)):
+    tilt = math.degrees(math.acos(min(1.0, max(-1.0, float((normals @ sky).max())))))
+    if tilt < 3.0:
         return
     turn, flip = pose[:3, :3], torch.diag(torch.tensor([1.0, -1.0, -1.0]).double())
     optical = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).double()
@@ -136,9 +155,10 @@ def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up
         "depth[:, ::-1], if the image is mirrored": turn @ mirror,
     }
     seen = turn.T @ normals[0]
-    fixes = [fix for fix, world in meant.items() if float(world @ seen @ sky) > math.cos(math.radians(5.0))]
+    level = math.cos(math.radians(min(5.0, tilt / 3)))
+    fixes = [fix for fix, world in meant.items() if float(world @ seen @ sky) > level]
     cosine = float(normals[0] @ sky)
-    if not fixes and cosine > -math.cos(math.radians(15.0)):
+    if not fixes and (tilt < 15.0 or cosine > -math.cos(math.radians(15.0))):
         return  # a frame that is tilted
     angle, other = math.degrees(math.acos(max(-1.0, cosine))), "`up`, if z is not up" if up is None else "another `up`"
     normal = ", ".join(f"{x:.2f}" for x in normals[0].tolist())
@@ -155,11 +175,21 @@ def _check_given_table(points: Float[Tensor, "n 3"], plane: Plane) -> None:
         raise BadArgument("table", found, "the table in the frame of a camera_pose in metres, whose z looks forward")
 
 
-def check_sizes(points: Float[Tensor, "n 3"], labels: Tensor, eye: Float[Tensor, "3"], plane: Plane) -> None:
-    """Refuse depth in another unit: every object is far larger, or smaller, than a hand can grasp."""
+def check_sizes(
+    points: Float[Tensor, "n 3"], labels: Tensor, pose: Float[Tensor, "4 4"], plane: Plane
+) -> tuple[str, ...]:
+    """Refuse depth in another unit: objects are far larger, or smaller, than a hand can grasp; note a high camera.
+
+    Counts of 0.25 mm read as millimetres put the camera four times too high above a table near z = 0.
+    """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
-    sizes = [float((part.amax(0) - part.amin(0)).max()) for part in parts if len(part) >= 100]
-    height = float(plane.height(eye))
-    if sizes and ((min(sizes) > 0.5 and height > 1.0) or (max(sizes) < 0.03 and height < 0.12)):
-        found = f"a camera {height:.3g} m above the table and objects of {min(sizes):.2g} to {max(sizes):.2g} m"
-        raise BadArgument("depth", found, UNIT)
+    sizes = sorted(float((part.amax(0) - part.amin(0)).max()) for part in parts if len(part) >= 100)
+    height, above_origin = float(plane.height(pose[:3, 3])), float(plane.normal @ pose[:3, 3])
+    scaled = plane.offset < -0.5 and any(abs(above_origin - factor * height) < 0.05 for factor in (0.25, 0.1))
+    found = f"a camera {height:.3g} m above the table"
+    if sizes:
+        most = sizes[len(sizes) // 5]  # nearly all objects are larger
+        large = (most > 0.2 and height > 1.5) or (scaled and not _is_own(pose) and most > 0.12 and height > 1.0)
+        if large or (most > 0.5 and height > 1.0) or (sizes[-1] < 0.03 and height < 0.12):
+            raise BadArgument("depth", f"{found} and objects of {sizes[0]:.2g} to {sizes[-1]:.2g} m", UNIT)
+    return (f"{found}: if it was not so high, depth_unit (--depth-unit) says the metres of a count",) * (height > 1.0)

@@ -100,7 +100,7 @@ class Scene(Value):
         supports = find_plausible(points[measured], image.obj_from_camera, table, up, depth_unit is not None)
         found, notes = label_image(image, supports[0], given, inside)
         if table is None and depth_unit is None:
-            check_sizes(points[measured], found[measured], image.obj_from_camera[:3, 3], supports[0].plane)
+            notes += check_sizes(points[measured], found[measured], image.obj_from_camera, supports[0].plane)
         planes, pixels = tuple(support.plane for support in supports), torch.nonzero(measured)
         target = None if mask is None else 1
         scene = cls(points[measured], found[measured], image, pixels, planes[0], target, planes[1:], notes)

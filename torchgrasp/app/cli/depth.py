@@ -4,6 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
+from torch import Tensor
+
 from torchgrasp.app.cli.command import Command, arguments, option, positional, required
 from torchgrasp.app.cli.inputs import OUT_CLOUD_HELP, ViewOptions, read_table
 from torchgrasp.app.report.scene import draw_scene
@@ -45,9 +47,16 @@ class _DepthCommand(Command):
     camera_pose: Path | None = option(
         None, "file with frame_from_camera, 4 x 4 (.npy or .txt); by default results are in the camera's frame"
     )
+    up: tuple[float, float, float] | None = option(None, "roughly against gravity, in the frame of the results")
     frames: tuple[Path, ...] = option(
         (), "more depth images of the camera, which stands still: the median of each pixel has less noise"
     )
+
+    @property
+    def vertical(self) -> Tensor | None:
+        """The vertical as a unit vector; None: not given."""
+        given: Any = {"up": self.up}
+        return ViewOptions(**given).vertical
 
     def images(self):
         """Return the depth image, the intrinsics, labels of the mask and the camera pose; None where not given."""
@@ -80,7 +89,7 @@ class CloudDepth(_DepthCommand):
         """Convert the depth image and write the cloud; return the exit code."""
         depth, camera, mask, pose = self.images()
         inside = None if mask is None else read_mask(mask, tuple(mask.shape))
-        cloud = cloud_from_depth(depth, camera, inside, pose, self.depth_unit)
+        cloud = cloud_from_depth(depth, camera, inside, pose, self.depth_unit, self.vertical)
         save_cloud(cloud, self.out)
         frame = "the camera's frame: give its vertical with --up" if pose is None else "the frame of the pose"
         print(f"{len(cloud)} points in {frame}, {self.out}")
@@ -104,7 +113,6 @@ class CloudScene(_DepthCommand):
     table: tuple[float, ...] | None = option(
         None, "height z of the table, or four numbers nx ny nz d of the plane n . p = d [m]; by default it is found"
     )
-    up: tuple[float, float, float] | None = option(None, "roughly against gravity, in the frame of the results")
     point: tuple[float, ...] | None = option(
         None, "column and row of a pixel on the target, or x y z [m] of a point on it"
     )
@@ -114,8 +122,6 @@ class CloudScene(_DepthCommand):
         picture = self.out.with_suffix(".png")
         if picture.resolve() in [path.resolve() for path in (self.depth, self.mask, *self.frames) if path]:
             raise BadArgument("--out", f"{self.out}, whose picture would replace {picture}", "another name")
-        if self.up is not None and not any(self.up):
-            raise BadArgument("--up", "a vector of length zero", "the direction that points up")
         seen = self._of_image() if self.intrinsics else self._of_cloud()
         save_scene(seen, self.out)
         draw_scene(seen, picture)
@@ -137,8 +143,8 @@ class CloudScene(_DepthCommand):
         depth, camera, mask, pose = self.images()
         table = None if self.table is None else read_table(self.table)
         chosen = "mask" if mask is None or len(mask[mask > 0].unique()) < 2 else "labels"
-        given = {"point": self.point, "table": table, "up": self.up, "depth_unit": self.depth_unit, chosen: mask}
-        return Scene.from_depth(depth, camera, pose, **given)
+        given = {"point": self.point, "table": table, "depth_unit": self.depth_unit, chosen: mask}
+        return Scene.from_depth(depth, camera, pose, **given, up=self.vertical)
 
     def _of_cloud(self) -> Scene:
         """Return the scene of a cloud."""
@@ -152,5 +158,5 @@ class CloudScene(_DepthCommand):
         given: Any = {"viewpoint": self.viewpoint, "unit": self.unit, "camera_pose": self.camera_pose}
         file = ViewOptions(**given).read("DEPTH", self.depth, whole=True)
         table = file.table if self.table is None else read_table(self.table)
-        seen = Scene.from_cloud(file.cloud, point=self.point, table=table, up=self.up)
+        seen = Scene.from_cloud(file.cloud, point=self.point, table=table, up=self.vertical)
         return dataclasses.replace(seen, notes=(*file.notes, *seen.notes))
