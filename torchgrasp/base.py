@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import numbers
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -11,7 +10,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.checks import check_moved, show
+from torchgrasp.checks import Range, check_moved, read_number, show
 from torchgrasp.errors import BadArgument, FailedRows, Status
 
 FINGERTIPS = (3, 5)  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
@@ -210,16 +209,9 @@ def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
 
 def check_whole(name: str, value: Any, low: int, high: int) -> None:
     """Raise `BadArgument` unless a value is a whole number in [low, high]."""
-    if not _is_number(value) or not low <= value <= high or value != int(value):
-        raise BadArgument(name, value if _is_number(value) else repr(value), f"a whole number in [{low}, {high}]")
+    read_number(name, value, int, Range(low, high))
 
 
 def check_number(name: str, value: Any, low: int | float, high: int | float) -> None:
     """Raise `BadArgument` unless a value is a number in [low, high]."""
-    if not _is_number(value) or not low <= value <= high:
-        raise BadArgument(name, value if _is_number(value) else repr(value), f"a number in [{low:g}, {high:g}]")
-
-
-def _is_number(value: Any) -> bool:
-    """Return whether a value is a real number; True and False are not."""
-    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+    read_number(name, value, float, Range(low, high))

@@ -129,7 +129,7 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
     if origin in (typing.Union, types.UnionType):
         return _read_union(name, value, hint, inside, call)
     if hint in (int, float, bool):
-        return _read_number(name, value, hint, NUMBERS.get(hint))
+        return read_number(name, value, hint, NUMBERS.get(hint))
     if is_tensor(hint):
         return _read_tensor(name, value, hint, call)
     if isinstance(origin, type) and origin not in (type, collections.abc.Callable):
@@ -147,7 +147,7 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
     return value
 
 
-def _read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
+def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
     """Return a number in a range, or a boolean, as a Python number; raise `BadArgument` otherwise."""
     number: Any = value
     if kind is bool:
@@ -164,7 +164,7 @@ def _read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any
 def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> Any:
     """Return an argument whose annotation has a mark, such as a range or `RIGID`."""
     if isinstance(mark, Range):
-        return _read_number(name, value, hint, mark)
+        return read_number(name, value, hint, mark)
     if mark == ANY and hint is float and isinstance(value, float):
         return value
     if mark == ANY and not call.strict:

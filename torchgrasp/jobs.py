@@ -1,7 +1,6 @@
 """Tasks in worker processes: a worker that hangs or dies loses only its own task."""
 
 import contextlib
-import functools
 import math
 import multiprocessing
 import os
@@ -17,6 +16,7 @@ import torch
 
 from torchgrasp.checks import Range, checked
 from torchgrasp.errors import MissingExtra, Status
+from torchgrasp.threads import one_thread
 
 Result = TypeVar("Result")
 Task = tuple[Any, ...]
@@ -45,40 +45,25 @@ def run_tasks(
         MissingExtra: pebble is not installed.
         Exception: the error of a task, when its turn comes.
     """
-    return _in_order(function, tasks, workers, limit) if workers else _run_here(function, tasks)
+    return _in_order(_run(function, tasks, workers, limit))
 
 
 def run_as_they_end(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
     """Run tasks as `run_tasks`; yield the index and the result of each task, in the order in which they end."""
-    if not workers:
-        yield from enumerate(_run_here(function, tasks))
-        return
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
         for number, ended in results:
             yield number, ended if isinstance(ended, Status) else ended.result()
 
 
-def _run_here(function: Callable[..., Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
-    """Run the tasks in this process on one thread; yield the results."""
-    for task in tasks:
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            result = function(*task)
-        finally:
-            torch.set_num_threads(threads)
-        yield result
-
-
 def _in_order(
-    function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
+    results: Generator[tuple[int, Future[Result] | Status], None, None],
 ) -> Generator[Result | Status, None, None]:
-    """Run the tasks in worker processes; yield the results in the order of the tasks."""
+    """Yield results in the order of the tasks."""
     early: dict[int, Future[Result] | Status] = {}
     turn = 0
-    with contextlib.closing(_run(function, tasks, workers, limit)) as results:
+    with contextlib.closing(results):
         for number, ended in results:
             early[number] = ended
             while turn in early:
@@ -90,7 +75,17 @@ def _in_order(
 def _run(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Run the tasks in worker processes; yield index and result as they end. A broken pool of workers is replaced."""
+    """Run the tasks; yield index and result as they end. A broken pool of worker processes is replaced."""
+    if not workers:
+        for number, task in enumerate(tasks):
+            future = Future[Result]()
+            with one_thread():
+                try:
+                    future.set_result(function(*task))
+                except Exception as error:
+                    future.set_exception(error)
+            yield number, future
+        return
     waiting, died = deque(enumerate(tasks)), set[int]()
     broken = 0
     while waiting:
@@ -126,7 +121,7 @@ def _run_pool(
                 except RuntimeError:  # the pool broke
                     return
                 running[number] = waiting.popleft()[1], future
-                future.add_done_callback(functools.partial(_tell, ended, number))
+                future.add_done_callback(lambda _, number=number: ended.put(number))
             try:
                 number = ended.get(timeout=1.0)  # a broken pool may never end some tasks
             except queue.Empty:
@@ -149,11 +144,6 @@ def _run_pool(
         pool.stop()
         with contextlib.suppress(TimeoutError):  # a signal can leave pebble's threads waiting for each other
             pool.join(10.0)
-
-
-def _tell(ended: "queue.SimpleQueue[int]", number: int, _: "Future[Any]") -> None:
-    """Put the index of a finished task into the queue."""
-    ended.put(number)
 
 
 def _begin(function: Callable[..., Any]) -> None:

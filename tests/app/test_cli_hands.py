@@ -124,14 +124,14 @@ def test_hand_check_prints_warnings_with_their_fixes(claw, capsys):
 
 def test_every_set_of_fingers_is_checked_and_tried(tmp_path, capsys, monkeypatch):
     """A draft of the Allegro hand has two; a fault of a further one is named, and four fingers are described."""
-    monkeypatch.setattr("torchgrasp.app.cli.hand_check.TRIAL_STARTS", 15)
+    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 15)
     assert main(["hand", "new", str(hands_folder() / "allegro" / "hand.urdf"), "--out", str(tmp_path / "mine")]) == 0
     assert re.search(r"default +[\w, ]*thumb\nfour +index, middle, ring, thumb\n", capsys.readouterr().out)
     words = ["hand", "check", str(tmp_path / "mine"), "--out", str(tmp_path / "hand.png")]
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "default on the shipped cylinder: " in said and "four on the shipped cylinder: " in said
-    monkeypatch.setattr("torchgrasp.app.cli.hand_check._try_objects", lambda hand, bar: True)
+    monkeypatch.setattr("torchgrasp.app.cli.hands._try_objects", lambda hand, bar: True)
     assert main([*words, "--fingers", "4"]) == 0
     said = capsys.readouterr().out
     assert "option four: 16 actuated" in said and "16 actuated of 16" in said

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.files.write import Refuse, is_file, read_bytes
+from torchgrasp.files.write import Refuse, read_bounded
 from torchgrasp.limits import JSON_BYTES, JSON_LETTERS, SHOWN_LETTERS
 
 
@@ -76,13 +76,10 @@ def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) 
 
     NaN and Infinity are not valid JSON, and no number of more than 4300 digits is read.
     """
-    if not is_file(path):  # a pipe or a device would block, or never end
-        raise refuse(f"{path}, which is no file", allowed)
+    data = read_bounded(path, most, allowed, refuse)
     try:
-        if path.stat().st_size > most:
-            raise ValueError(f"more than {most} bytes")
-        value = json.loads(read_bytes(path).decode("utf-8"), parse_constant=_refuse_constant)
-    except (OSError, ValueError, RecursionError) as error:
+        value = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
         raise refuse(f"{path}: {error}", allowed) from error
     return Field(path, "", value, refuse)
 

@@ -1,6 +1,7 @@
 """Values and tensors with metadata as a safetensors file, which is checked when it is read."""
 
 import dataclasses
+import functools
 import json
 import typing
 from collections.abc import Callable, Collection
@@ -16,7 +17,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import is_tensor
 from torchgrasp.errors import ModelFileError
-from torchgrasp.files.write import is_file, write_file
+from torchgrasp.files.write import check_file, write_file
 from torchgrasp.limits import LARGEST_NUMBER, TENSOR_FILE_BYTES
 
 Item = TypeVar("Item")
@@ -55,12 +56,8 @@ def load_tensors(
             tensors, or a number is not finite or beyond `LARGEST_NUMBER`.
     """
     allowed = names.union(optional)
-    if not is_file(path):
-        raise ModelFileError("path", f"{path}, which is no file", f"a safetensors file of kind {kind!r}")
-    if Path(path).stat().st_size > TENSOR_FILE_BYTES:
-        raise ModelFileError(
-            "path", f"{path} of {Path(path).stat().st_size} bytes", f"at most {TENSOR_FILE_BYTES} bytes"
-        )
+    refuse = functools.partial(ModelFileError, "path")
+    check_file(path, TENSOR_FILE_BYTES, f"a safetensors file of kind {kind!r}", refuse)
     try:
         with safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("torchgrasp", "{}"))
@@ -68,20 +65,20 @@ def load_tensors(
             # The others stay unread. A copy is aligned as what was saved: unaligned numbers round otherwise.
             tensors = {name: file.get_tensor(name).clone() for name in found & allowed}
     except (SafetensorError, OSError, ValueError, KeyError, RecursionError) as error:
-        raise ModelFileError("path", f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
+        raise refuse(f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
     if not isinstance(meta, dict) or not all(isinstance(x, str) for x in meta.values()):
-        raise ModelFileError("path", f"{path}: metadata that is no object of texts", f"kind {kind!r}")
+        raise refuse(f"{path}: metadata that is no object of texts", f"kind {kind!r}")
     if meta.get("kind") != kind or meta.get("version") != VERSION:
         other = f"kind {meta.get('kind')!r}, version {meta.get('version')!r}"
-        raise ModelFileError("path", f"{path}: {other}", f"kind {kind!r}, version {VERSION!r}")
+        raise refuse(f"{path}: {other}", f"kind {kind!r}, version {VERSION!r}")
     if not names <= found <= allowed:
-        raise ModelFileError("path", f"{path}: tensors {sorted(found)}", f"tensors {sorted(names)}")
+        raise refuse(f"{path}: tensors {sorted(found)}", f"tensors {sorted(names)}")
     for name, t in tensors.items():
         if t.dtype not in DTYPES:
-            raise ModelFileError("path", f"{path}: {name} of {t.dtype}", f"one of {', '.join(map(str, DTYPES))}")
+            raise refuse(f"{path}: {name} of {t.dtype}", f"one of {', '.join(map(str, DTYPES))}")
         if t.is_floating_point() and not bool((t.abs() <= LARGEST_NUMBER).all()):
             found = f"{path}: a number beyond {LARGEST_NUMBER:g} or a non-finite number in {name}"
-            raise ModelFileError("path", found, "finite numbers")
+            raise refuse(found, "finite numbers")
     return tensors, meta
 
 

@@ -82,11 +82,19 @@ def read_bytes(path: Path | str) -> bytes:
 
 def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> bytes:
     """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for others."""
+    check_file(path, most, allowed, refuse)
+    try:
+        return read_bytes(path)
+    except OSError as error:
+        raise refuse(f"{path}: {error}", allowed) from error
+
+
+def check_file(path: Path | str, most: int, allowed: str, refuse: Refuse) -> None:
+    """Raise the error of `refuse` unless a path is a regular file, which ends, of at most `most` bytes."""
     if not is_file(path):
         raise refuse(f"{path}, which is no file", allowed)
     if (size := Path(path).stat().st_size) > most:
         raise refuse(f"{path} of {size} bytes", f"{allowed} of at most {most} bytes")
-    return read_bytes(path)
 
 
 def sha256(path: Path | str) -> str:

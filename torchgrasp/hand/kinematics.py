@@ -29,8 +29,8 @@ class KinematicTree(Value):
     `prismatic` is 1 for a sliding joint, and `moves[l, j]` is 1 if joint j moves link l.
 
     In `tables` the links are sorted by level; `level_sizes` counts them. `joint` is the index of the joint that moves a
-    link, 0 for a fixed link. `parent` is the index of a link's parent in the level above. In a `straight` level the
-    parents are 0, 1, 2 and so on. `places` are the indices of `link_names` among the sorted links.
+    link, 0 for a fixed link. `parent` is the index of a link's parent in the level above. `places` are the indices of
+    `link_names` among the sorted links.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -53,7 +53,6 @@ class KinematicTree(Value):
     joint: Int[Tensor, " l"]
     parent: Int[Tensor, " l"]
     level_sizes: tuple[int, ...]
-    straight: tuple[bool, ...]
     places: Int[Tensor, " l"]
     slides: bool
 
@@ -73,12 +72,11 @@ class KinematicTree(Value):
         levels, parents = local.split(self.level_sizes, 2), self.parent.split(self.level_sizes)
         frames = [levels[0]] if root is None else [root[:, :, None]]
         for k in range(1, len(levels)):
-            above, level = frames[-1], levels[k]
+            level = levels[k]
             if root is None and k == 1:  # the root is the identity
                 frames.append(level)
                 continue
-            if not self.straight[k]:
-                above = above.index_select(2, parents[k])
+            above = frames[-1].index_select(2, parents[k])
             frame = above[:, 0, None] * level[0]
             frame = torch.addcmul(frame, above[:, 1, None], level[1])
             frame = torch.addcmul(frame, above[:, 2, None], level[2])
@@ -184,7 +182,6 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
         joint=torch.tensor([index.get(name, 0) for name in names]),
         parent=torch.tensor([k for level in parents for k in level]),
         level_sizes=tuple(len(level) for level in levels),
-        straight=tuple(level == list(range(len(levels[max(k - 1, 0)]))) for k, level in enumerate(parents)),
         places=torch.tensor([names.index(name) for name in links]),
         slides=any(j.kind == "prismatic" and j.child in part for j in joints),
     )

@@ -114,7 +114,7 @@ def bic_curve(
     components: Sequence[int] = tuple(range(5, 61)),
     *,
     checkpoints: Path | str | None = None,
-    observer: Callable[[int, GraspMixture], None] = lambda m, mixture: None,
+    observer: Callable[[int, GraspMixture], object] = lambda m, mixture: None,
     **fit: Any,
 ) -> BicCurve:
     """Fit a mixture for each number of components, and return the BIC of each (Fig. 6 b, d).

@@ -4,6 +4,7 @@ A published URDF is repaired (`repair`), its meshes are replaced by simple shape
 are guessed (`pads`). Every guess is marked in the text.
 """
 
+import functools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -182,49 +183,22 @@ def _toml_text(
     urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]], approach: Triple, names: tuple[str, str], seed: int
 ) -> str:
     """Return the text of a hand.toml; `pads` are by link, `sets` by option; `names` are of hand and URDF file."""
+    import jinja2
+
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    engine = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    engine.filters["toml"] = functools.partial(json.dumps, ensure_ascii=False)
     coupling, (kp, kd) = _coupling(urdf), _gains(urdf)
-    lines = [
-        "# A draft. Lengths [m], angles [rad], in the link frames of the URDF. Look over what is marked CHECK.",
-        f"name = {_toml(names[0])}",
-        f"urdf = {_toml(names[1])}",
-        f"base_link = {_toml(urdf.root)}",
-        f"approach = {_toml(approach)}  # CHECK: out of the palm",
-        "limit_margin = 0.0  # taken off both ends of every joint's range",
-        "",
-        "[actuators]  # joint position control; effort [N m] and velocity [rad/s] are those of the URDF",
-        f"kp = {kp:.3g}  # CHECK: [N m/rad]",
-        f"kd = {kd:.3g}  # [N m s/rad]",
-    ]
-    if coupling:
-        lines += ["", "# joint = ratio * source + offset", "[coupling]"]
-    for joint, (source, ratio, offset) in coupling.items():
-        lines.append(f"{_toml(joint)} = {{ source = {_toml(source)}, ratio = {ratio!r}, offset = {offset!r} }}")
-    lines += ["", *_finger_lines(urdf, pads, sets)]
-    lines += ["[self_collision]", "# The pairs of links that meet in some random postures, but not in nearly all."]
-    lines += ["pairs = [", *(f"  {_toml(pair)}," for pair in collision_pairs(urdf, coupling, seed=seed)), "]", ""]
-    return "\n".join(lines)
-
-
-def _finger_lines(urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]]) -> list[str]:
-    """Return the lines of a hand.toml for its options and fingers."""
     chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
     called = {tip: tip.removesuffix("_tip") for tip in pads}
-    lines = ["# Which fingers grasp, in grasp order; every other joint is parked."]
-    for option, tips in sets.items():
-        guessed = "  # CHECK" if len(tips) < len(pads) else ""
-        lines += [f"[options.{option}]", f"fingers = {_toml([called[tip] for tip in tips])}{guessed}"]
-        parked = _parked(urdf, {joint for tip in tips for joint in chains[tip]})
-        if parked:
-            row = ", ".join(f"{_toml(joint)} = {value!r}" for joint, value in parked.items())
-            lines.append(f"parked = {{ {row} }}  # CHECK: out of the way of the others")
-        lines.append("")
-    for tip, pad in pads.items():
-        lines += ["[[finger]]", f"name = {_toml(called[tip])}"]
-        lines += [f"joints = {_toml(chains[tip])}", f"tip_link = {_toml(tip)}"]
-        lines += [f"contact = {_toml(pad.contact)}  # CHECK: the middle of the pad", f"normal = {_toml(pad.normal)}"]
-        sphere = ['tip = "sphere"', f"center = {_toml(pad.center)}", f"radius = {pad.radius!r}"]
-        lines += [*(sphere if pad.radius else ['tip = "point"']), ""]
-    return lines
+    options = {
+        option: ([called[tip] for tip in tips], _parked(urdf, {joint for tip in tips for joint in chains[tip]}))
+        for option, tips in sets.items()
+    }
+    return engine.get_template("hand.toml.jinja").render(
+        name=names[0], file=names[1], urdf=urdf, approach=approach, kp=kp, kd=kd, coupling=coupling, options=options,
+        pads=pads, names=called, chains=chains, pairs=collision_pairs(urdf, coupling, seed=seed),
+    )  # fmt: skip
 
 
 def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
@@ -241,7 +215,3 @@ def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
     for link in (x.name for x in urdf.links if x.name not in parents):
         ends += [x for x in (link, *(j.parent for j in urdf.joints_above(link))) if x in shaped][:1]
     return tuple(e for e in dict.fromkeys(ends) if urdf.movers(e))
-
-
-def _toml(x: object) -> str:
-    return json.dumps(x, ensure_ascii=False)

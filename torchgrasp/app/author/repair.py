@@ -241,35 +241,36 @@ def _triangle(inertia: np.ndarray) -> tuple[float, ...]:
 def urdf_text(urdf: Urdf) -> str:
     """Return a URDF as XML text, which `read_urdf` reads without loss."""
     robot = ET.Element("robot", name=urdf.name)
-    for link in urdf.links:
-        element = ET.SubElement(robot, "link", name=link.name)
-        inertial = ET.SubElement(element, "inertial")
-        ET.SubElement(inertial, "origin", xyz=_words(link.com))
-        ET.SubElement(inertial, "mass", value=_words([link.mass]))
-        keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-        ET.SubElement(inertial, "inertia", {k: _words([v]) for k, v in zip(keys, link.inertia, strict=True)})
-        for shape in link.shapes:
-            collision = ET.SubElement(element, "collision")
-            ET.SubElement(collision, "origin", xyz=_words(shape.xyz), rpy=_words(shape.rpy))
-            sizes = [shape.size] if shape.kind == "box" else [[x] for x in shape.size]
-            numbers = {k: _words(v) for k, v in zip(SIZES[shape.kind], sizes, strict=True)}
-            ET.SubElement(ET.SubElement(collision, "geometry"), shape.kind, numbers)
+    for x in urdf.links:
+        link = _add(robot, "link", name=x.name)
+        inertial = _add(link, "inertial")
+        _add(inertial, "origin", xyz=x.com)
+        _add(inertial, "mass", value=x.mass)
+        _add(inertial, "inertia", **dict(zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), x.inertia, strict=True)))
+        for shape in x.shapes:
+            collision = _add(link, "collision")
+            _add(collision, "origin", xyz=shape.xyz, rpy=shape.rpy)
+            sizes = [shape.size] if shape.kind == "box" else shape.size
+            _add(_add(collision, "geometry"), shape.kind, **dict(zip(SIZES[shape.kind], sizes, strict=True)))
     for j in urdf.joints:
-        joint = ET.SubElement(robot, "joint", name=j.name, type=j.kind)
-        ET.SubElement(joint, "origin", xyz=_words(j.xyz), rpy=_words(j.rpy))
-        ET.SubElement(joint, "parent", link=j.parent)
-        ET.SubElement(joint, "child", link=j.child)
-        if j.kind == "fixed":
-            continue
-        ET.SubElement(joint, "axis", xyz=_words(j.axis))
-        limits = {"lower": j.lower, "upper": j.upper, "effort": j.effort, "velocity": j.velocity}
-        ET.SubElement(joint, "limit", {k: _words([v]) for k, v in limits.items()})
+        joint = _add(robot, "joint", name=j.name, type=j.kind)
+        _add(joint, "origin", xyz=j.xyz, rpy=j.rpy)
+        _add(joint, "parent", link=j.parent)
+        _add(joint, "child", link=j.child)
+        if j.kind != "fixed":
+            _add(joint, "axis", xyz=j.axis)
+            _add(joint, "limit", lower=j.lower, upper=j.upper, effort=j.effort, velocity=j.velocity)
         if j.mimic:
-            ratio, offset = _words([j.mimic.ratio]), _words([j.mimic.offset])
-            ET.SubElement(joint, "mimic", joint=j.mimic.source, multiplier=ratio, offset=offset)
+            _add(joint, "mimic", joint=j.mimic.source, multiplier=j.mimic.ratio, offset=j.mimic.offset)
     ET.indent(robot)
     return ET.tostring(robot, encoding="unicode") + "\n"
 
 
-def _words(values: Collection[float]) -> str:
-    return " ".join(f"{float(x) + 0.0!r}" for x in values)
+def _add(above: ET.Element, tag: str, **attributes: str | float | Sequence[float]) -> ET.Element:
+    """Add an element with names, numbers or several numbers as attributes; negative zero becomes zero."""
+    element = ET.SubElement(above, tag)
+    for key, value in attributes.items():
+        element.set(
+            key, value if isinstance(value, str) else " ".join(f"{x + 0.0!r}" for x in np.ravel(value).tolist())
+        )
+    return element

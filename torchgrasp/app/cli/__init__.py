@@ -18,51 +18,42 @@ import tyro
 from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
-from torchgrasp.app.cli import clouds, depth, doctor, evaluate, export, grasps, hand_check, hands
+from torchgrasp.app.cli import clouds, depth, doctor, evaluate, export, grasps, hands
 from torchgrasp.app.cli.command import Command, execute
 from torchgrasp.errors import BadArgument, GraspError
 
 __all__ = ["main", "run_and_exit"]
 
-COMMANDS: dict[str, Callable[..., Command | int]] = {
-    "grasp": grasps.Grasp,
-    "view": grasps.View,
-    "objects": grasps.Objects,
-    "export": export.Export,
-    "import": export.Import,
-    "evaluate": evaluate.Evaluate,
-    "campaign": evaluate.Campaign,
-    "cloud check": clouds.CloudCheck,
-    "cloud cut": clouds.CloudCut,
-    "cloud depth": depth.CloudDepth,
-    "cloud scene": depth.CloudScene,
-    "cloud thin": clouds.CloudThin,
-    "cloud render": clouds.CloudRender,
-    "cloud views": clouds.CloudViews,
-    "shape surface": clouds.ShapeSurface,
-    "hand new": hands.HandNew,
-    "hand check": hand_check.HandCheck,
-    "hand sample": hands.HandSample,
-    "hand train": hands.HandTrain,
-    "doctor": doctor.Doctor,
-    "selftest": doctor.Selftest,
+CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
+    "Plan grasps": {"grasp": grasps.Grasp, "view": grasps.View, "objects": grasps.Objects},
+    "Exchange grasps with other programs": {"export": export.Export, "import": export.Import},
+    "Try many grasps in simulation": {"evaluate": evaluate.Evaluate, "campaign": evaluate.Campaign},
+    "Point clouds and shapes": {
+        "cloud check": clouds.CloudCheck,
+        "cloud cut": clouds.CloudCut,
+        "cloud depth": depth.CloudDepth,
+        "cloud scene": depth.CloudScene,
+        "cloud thin": clouds.CloudThin,
+        "cloud render": clouds.CloudRender,
+        "cloud views": clouds.CloudViews,
+        "shape surface": clouds.ShapeSurface,
+    },
+    "Hands": {
+        "hand new": hands.HandNew,
+        "hand check": hands.HandCheck,
+        "hand sample": hands.HandSample,
+        "hand train": hands.HandTrain,
+    },
+    "Installation": {"doctor": doctor.Doctor, "selftest": doctor.Selftest},
 }
-"""Commands by name."""
+"""Commands by name, in the chapters of the help."""
+COMMANDS = {name: command for commands in CHAPTERS.values() for name, command in commands.items()}
 GROUPS = {
     "cloud": "Check, cut, thin and make point clouds.",
     "shape": "Write the estimated shape.",
     "hand": "Add a hand: draft, check, sample, train.",
 }
 """Groups of commands, by the first word."""
-CHAPTERS = {
-    "Plan grasps": ("grasp", "view", "objects"),
-    "Exchange grasps with other programs": ("export", "import"),
-    "Try many grasps in simulation": ("evaluate", "campaign"),
-    "Point clouds and shapes": ("cloud", "shape"),
-    "Hands": ("hand",),
-    "Installation": ("doctor", "selftest"),
-}
-"""Chapters of the help: commands or groups of commands."""
 
 START = """torchgrasp: dexterous fingertip grasps from a partial point cloud
 
@@ -177,13 +168,9 @@ def _parser() -> SubcommandApp:
 def format_help() -> str:
     """Return the help text: all commands in chapters, each with its first sentence."""
     lines = ["torchgrasp: dexterous fingertip grasps from a partial point cloud", ""]
-    for chapter, words in CHAPTERS.items():
-        lines.append(chapter)
-        for name, command in COMMANDS.items():
-            if name.split()[0] in words:
-                first = " ".join((command.__doc__ or "").split("\n\n")[0].split())
-                lines.append(f"  {name:15}{first}")
-        lines.append("")
+    for chapter, commands in CHAPTERS.items():
+        firsts = {name: (command.__doc__ or "").split("\n\n")[0].split() for name, command in commands.items()}
+        lines += [chapter, *(f"  {name:15}{' '.join(words)}" for name, words in firsts.items()), ""]
     return "\n".join([*lines, "Options of a command: torchgrasp COMMAND --help. Version: torchgrasp --version."])
 
 

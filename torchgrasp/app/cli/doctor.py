@@ -21,8 +21,6 @@ from torchgrasp.specs import Simulator
 CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", "safetensors")
 """Packages without which nothing runs."""
 SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}  # simulators, and the extra that installs each
-OPTIONAL = {"distributed": ("cluster", "`torchgrasp campaign --scheduler`")}
-"""Packages of one command each: the extra that installs it, and the command."""
 
 
 class Finding(NamedTuple):
@@ -54,18 +52,16 @@ class Doctor(Command):
 
 def find_parts() -> list[Finding]:
     """Return the state of every part of the installation."""
+    hands = ", ".join(sorted(p.parent.name for p in hands_folder().glob("*/hand.toml")))
     return [
-        Finding(
-            "torchgrasp",
-            f"{__version__}, hands: {', '.join(sorted(p.parent.name for p in hands_folder().glob('*/hand.toml')))}",
-        ),
+        Finding("torchgrasp", f"{__version__}, hands: {hands}"),
         Finding("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"),
         *(_package(name) for name in CORE),
         Finding("processor", f"{os.cpu_count()} cores; a command uses one, and --workers N uses N"),
         _gpu(),
         *(_simulator(name) for name in SIMULATORS),
         *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
-        *(_option(name) for name in OPTIONAL),
+        _dask(),
     ]
 
 
@@ -95,17 +91,12 @@ class Selftest(Command):
                     bar.update()
                 right, seconds = sum(x.right for x in results), time.perf_counter() - begin
                 bar.write(f"{name:8}{seconds:6.1f} s  {right} of {len(GOLDEN)} verdicts right")
-        rows = [("object", "hand", "expected", *found)]
+        rows, words = [("object", "hand", "expected", *found)], {True: "held", False: "lost"}
         for k, case in enumerate(GOLDEN):
-            verdicts = [f"{_verdict(x[k].held)}{'' if x[k].right else ' (wrong)'}" for x in found.values()]
-            rows.append((case.object, case.hand, _verdict(case.held), *verdicts))
+            verdicts = [f"{words[x[k].held]}{'' if x[k].right else ' (wrong)'}" for x in found.values()]
+            rows.append((case.object, case.hand, words[case.held], *verdicts))
         print(f"\n{format_columns(rows, left=range(len(rows[0])))}")
         return 0 if all(x.right for results in found.values() for x in results) else 1
-
-
-def _verdict(held: bool) -> str:
-    """Return the verdict on a lift in one word."""
-    return "held" if held else "lost"
 
 
 def _package(name: str, fix: str = "pip install torchgrasp") -> Finding:
@@ -116,11 +107,11 @@ def _package(name: str, fix: str = "pip install torchgrasp") -> Finding:
         return Finding(name, "missing", fix)
 
 
-def _option(name: str) -> Finding:
-    """Return the version of a package that only one command needs; it may be missing."""
-    extra, command = OPTIONAL[name]
-    found = _package(name)
-    return found if not found.fix else Finding(name, f"none; {command} needs it: pip install 'torchgrasp[{extra}]'")
+def _dask() -> Finding:
+    """Return the version of Dask's scheduler, which only one command needs; a missing Dask is not a fault."""
+    need = "none; `torchgrasp campaign --scheduler` needs it: pip install 'torchgrasp[cluster]'"
+    found = _package("distributed")
+    return Finding(found.part, need) if found.fix else found
 
 
 def _gpu() -> Finding:

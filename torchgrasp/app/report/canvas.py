@@ -271,3 +271,10 @@ def encode_png(image: Any) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, format="PNG", compress_level=4)
     return buffer.getvalue()
+
+
+def encode_figure(figure: Any) -> bytes:
+    """Return the bytes of a PNG of a matplotlib figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()

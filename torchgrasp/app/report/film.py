@@ -14,7 +14,7 @@ from torchgrasp.app.report.canvas import (
     PAPER,
     Canvas,
     Direction,
-    encode_png,
+    encode_figure,
     frame_camera,
 )
 from torchgrasp.app.report.run import LOST, Moment, explain_loss, first_touches, moments_of, moved_in_hand, tick_of
@@ -26,7 +26,6 @@ from torchgrasp.hand.hand import Hand
 
 if TYPE_CHECKING:
     import trimesh
-    from PIL.Image import Image
 
 WIDTH, STILL, TITLE = 1680, 340, 44
 """Width of the strip, height of its stills with titles, and height of a title [pixels]."""
@@ -42,19 +41,35 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
         closure: the result of the closing.
         direction: direction from the object to the camera.
     """
-    from PIL import Image, ImageDraw, ImageFont
+    from matplotlib.figure import Figure
 
     moments = moments_of(closure, _centre(mesh), hand.tips.names)
-    plots = _draw_plots(mesh, hand, closure, moments)
-    sheet = Image.new("RGB", (WIDTH, STILL + plots.height), PAPER)
-    pen, font, width = ImageDraw.Draw(sheet), ImageFont.load_default(20), WIDTH // len(moments)
-    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction, (width, STILL - TITLE))
+    plots, time, count = _list_plots(mesh, hand, closure), to_array(closure.time), len(moments)
+    heights = [200 if title.endswith(":") else 110 for title, *_ in plots]
+    height = STILL + sum(heights) + 50 * len(plots) + 76
+    figure = Figure((WIDTH / 100, height / 100), dpi=100, facecolor=PAPER)
+    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction, (WIDTH // count, STILL - TITLE))
     for k, (still, moment) in enumerate(zip(stills, moments, strict=True)):
-        sheet.paste(Image.fromarray(still), (k * width, TITLE))
+        axis = figure.add_axes((k / count, 1 - STILL / height, 1 / count, (STILL - TITLE) / height))
+        axis.imshow(still, aspect="auto")
+        axis.set_axis_off()
         title = f"{LETTERS[k]}  {float(closure.time[moment.tick]):.2f} s  {moment.name}"
-        pen.text((k * width + 14, 12), title, _color(moment), font)
-    sheet.paste(plots, (0, STILL))
-    return encode_png(sheet)
+        axis.set_title(title, loc="left", x=0.04, color=_color(moment), fontsize=14)
+
+    figure.subplots_adjust(0.05, 60 / height, 0.985, 1 - (STILL + 62) / height, hspace=50 / float(np.mean(heights)))
+    axes = figure.subplots(len(plots), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for axis, plot in zip(axes, plots, strict=True):
+        _draw_plot(axis, time, *plot)
+    for finger, tick in zip(closure.contact_order, first_touches(closure), strict=True):
+        axes[0].plot(time[tick], 0.0, "^", color=FINGERS[finger], markersize=12, clip_on=False, zorder=3)
+    for letter, moment in zip(LETTERS, moments, strict=False):
+        at, color = float(closure.time[moment.tick]), _color(moment)
+        for axis in axes:
+            axis.axvline(at, color=color, linewidth=2 if color == ALARM else 1, clip_on=False)
+        place = {"xy": (at, 1.0), "xycoords": axes[0].get_xaxis_transform(), "ha": "center"}
+        axes[0].annotate(letter, xytext=(0, 30), textcoords="offset points", color=color, fontsize=14, **place)
+    axes[-1].set_xlabel("time [s]", fontsize=13, color=INK)
+    return encode_figure(figure)
 
 
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
@@ -113,34 +128,6 @@ def _draw_stills(
         canvas.add_table(seen + b, table)
         pictures.append(canvas.render(frame_camera(seen + b, direction, size=size), size))
     return pictures
-
-
-def _draw_plots(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, moments: list[Moment]) -> "Image":
-    """Draw plots of fingertip forces, blends and sliding, and of motions, over a common time axis."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from PIL import Image
-
-    plots, time = _list_plots(mesh, hand, closure), to_array(closure.time)
-    heights = [200 if title.endswith(":") else 110 for title, *_ in plots]
-    height = sum(heights) + 50 * len(plots) + 76
-    figure = Figure((WIDTH / 100, height / 100), dpi=100, facecolor=PAPER)
-    figure.subplots_adjust(0.05, 60 / height, 0.985, 1 - 62 / height, hspace=50 / float(np.mean(heights)))
-    axes = figure.subplots(len(plots), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-    for axis, plot in zip(axes, plots, strict=True):
-        _draw_plot(axis, time, *plot)
-    for finger, tick in zip(closure.contact_order, first_touches(closure), strict=True):
-        axes[0].plot(time[tick], 0.0, "^", color=FINGERS[finger], markersize=12, clip_on=False, zorder=3)
-    for letter, moment in zip(LETTERS, moments, strict=False):
-        at, color = float(closure.time[moment.tick]), _color(moment)
-        for axis in axes:
-            axis.axvline(at, color=color, linewidth=2 if color == ALARM else 1, clip_on=False)
-        place = {"xy": (at, 1.0), "xycoords": axes[0].get_xaxis_transform(), "ha": "center"}
-        axes[0].annotate(letter, xytext=(0, 30), textcoords="offset points", color=color, fontsize=14, **place)
-    axes[-1].set_xlabel("time [s]", fontsize=13, color=INK)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
 
 
 def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[Any]) -> None:

@@ -215,16 +215,12 @@ def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tu
     pressed, rises = tick_of(closure, 2), bool(closure.phases[2].isfinite())
     time, start = float(closure.time[tick]), float(closure.time[pressed])
     phase = "closed" if not rises or tick <= pressed else "rose" if time < start + LIFT_TIME else "held it"
-    seen = closure.status not in (Status.START_OVERLAP, Status.UNSTABLE, Status.TOO_HEAVY)
-    reason = (seen and (_never_touched(closure, fingers) or _first_to_go(closure, tick, fingers))) or ""
+    never = " and ".join(name for finger, name in enumerate(fingers) if finger not in closure.contact_order)
+    reason = f"{never} never touched the object" if never else _first_to_go(closure, tick, fingers)
+    if closure.status in (Status.START_OVERLAP, Status.UNSTABLE, Status.TOO_HEAVY) or not reason:
+        reason = closure.status.sentence
     lost = "Put down from" if closure.status is Status.TOO_HEAVY else "Lost at"
-    return f"{lost} {time:.2f} s, while the hand {phase}: {reason or closure.status.sentence}."
-
-
-def _never_touched(closure: ClosureResult, fingers: tuple[str, ...]) -> str:
-    """Return a text that names the fingers that never touched the object."""
-    never = [name for finger, name in enumerate(fingers) if finger not in closure.contact_order]
-    return f"{' and '.join(never)} never touched the object" if never else ""
+    return f"{lost} {time:.2f} s, while the hand {phase}: {reason}."
 
 
 def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) -> str:

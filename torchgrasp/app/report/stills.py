@@ -19,7 +19,7 @@ from torchgrasp.app.report.canvas import (
     TABLE,
     Canvas,
     Direction,
-    encode_png,
+    encode_figure,
     map_colors,
     rgb,
 )
@@ -86,37 +86,33 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 
     Arrows on the fingertips are their normals. The palm's axes x, y and z are red, green and blue.
     """
-    from PIL import Image, ImageDraw, ImageFont
+    from matplotlib.figure import Figure
+    from PIL import Image
 
-    font, eye, width, height, bar = ImageFont.load_default(20), (1.0, -0.9, 0.5), 675, 540, 30
+    eye, bars = (1.0, -0.9, 0.5), 0.3 * (hand.dof + 2)  # height of the ranges [inches], 0.3 for each joint
     views = [
         ("a posture with the pads face to face", joints, eye),
         ("the same from another side", joints, rotated(eye, 110.0)),
         ("every joint at its lower limit", hand.lower.to(joints), eye),
         ("every joint at its upper limit", hand.upper.to(joints), eye),
     ]
-    sheet = Image.new("RGB", (2 * width, 2 * height + bar * (hand.dof + 2)), PAPER)
-    pen = ImageDraw.Draw(sheet)
-    for k, (title, posture, direction) in enumerate(views):
-        picture = Image.open(io.BytesIO(draw_posture(hand, posture, direction)))
-        x, y = k % 2 * width, k // 2 * height
-        sheet.paste(picture.resize((width, height), Image.Resampling.LANCZOS), (x, y))
-        pen.text((x + 16, y + 12), title, INK, font)
-
-    low, high = float(hand.lower.min()), float(hand.upper.max())
-    left, right, y = 380, 2 * width - 260, 2 * height + bar // 2
-    pen.text((16, y), "joint [degrees], the posture as a mark", INK, font)
-    for name, color, *angles in zip(
-        hand.joint_names, _joint_colors(hand), hand.lower.tolist(), hand.upper.tolist(), joints.tolist(), strict=True
-    ):
-        y += bar
-        first, last, at = (left + (right - left) * (q - low) / (high - low) for q in angles)
-        pen.text((16, y), name[:34], INK, font)
-        pen.line([(left, y + 12), (right, y + 12)], GRID, 1)
-        pen.rounded_rectangle([first, y + 6, last, y + 18], 5, color)
-        pen.line([(at, y), (at, y + 24)], INK, 3)
-        pen.text((right + 20, y), " to ".join(f"{np.rad2deg(q):.0f}" for q in angles[:2]), INK, font)
-    return encode_png(sheet)
+    figure = Figure((13.5, 10.8 + bars), dpi=100, facecolor=PAPER, layout="constrained")
+    stills, ranges = figure.subfigures(2, 1, squeeze=False, height_ratios=(10.8, bars)).flat
+    for axis, (title, posture, direction) in zip(stills.subplots(2, 2).flat, views, strict=True):
+        axis.imshow(Image.open(io.BytesIO(draw_posture(hand, posture, direction))))
+        axis.set_title(title, loc="left", color=INK, fontsize=14)
+        axis.set_axis_off()
+    low, high, at = (np.rad2deg(to_array(x)) for x in (hand.lower, hand.upper, joints))
+    axis = ranges.subplots()
+    axis.barh(hand.joint_names, high - low, 0.4, low, color=_joint_colors(hand))
+    axis.plot(at, hand.joint_names, "|", color=INK, markersize=16, markeredgewidth=3)
+    axis.set_xlabel("ranges of the joints [degrees], the posture as a mark", color=INK)
+    axis.invert_yaxis()
+    axis.grid(axis="x", color=GRID)
+    axis.margins(x=0.02)
+    axis.set(axisbelow=True, facecolor=PAPER)
+    axis.spines[:].set_visible(False)
+    return encode_figure(figure)
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
