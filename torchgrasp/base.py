@@ -1,7 +1,6 @@
 """The base classes of all values: frozen dataclasses of tensors, and batches of them."""
 
 import dataclasses
-import functools
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -37,18 +36,13 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
         return function(*found) if all(tensors) else found[0]
 
     kind = type(values[0])
-    fields = {name: merge(name, *(getattr(value, name) for value in values)) for name in _names(kind)}
+    names = [f.name for f in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
+    fields = {name: merge(name, *(getattr(value, name) for value in values)) for name in names}
     if hasattr(kind, "__post_init__"):
         return kind(**fields)
     new = object.__new__(kind)  # checked fields need no second check, and loops make thousands of values
     new.__dict__.update(fields)
     return new
-
-
-@functools.cache
-def _names(kind: type) -> tuple[str, ...]:
-    """Return the field names of a value class."""
-    return tuple(f.name for f in dataclasses.fields(kind))
 
 
 class Value:

@@ -207,7 +207,8 @@ class TrialSpec(Value):
         """Check fields that depend on each other."""
         choose_options(self.closing, self.options)
         check_sensor(self.sensor, self.closing, self.holding)
-        check_force(self.force, self.max_force)
+        if self.max_force is not None and self.force > self.max_force:
+            raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
@@ -226,9 +227,3 @@ def check_sensor(sensor: SensorModel, closing: str, holding: str) -> None:
         raise BadArgument("sensor", poor, allowed.format(f"closing {closing!r}"))
     if not sensor.full and closing != "open_loop" and holding not in ("force", "position"):
         raise BadArgument("sensor", poor, allowed.format(f"holding {holding!r}"))
-
-
-def check_force(force: float, max_force: float | None) -> None:
-    """Raise `BadArgument` for a desired force [N] above the largest allowed one."""
-    if max_force is not None and force > max_force:
-        raise BadArgument("force", force, f"at most max_force, {max_force:g}")

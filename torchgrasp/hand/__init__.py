@@ -8,17 +8,6 @@ from torchgrasp.hand.load import find_hand, hand_of, hands_folder, load_hand, wi
 from torchgrasp.hand.self_collision import SelfCollision
 
 __all__ = [
-    "ActuatedJoints",
-    "Actuator",
-    "CollisionSpheres",
-    "Fingertips",
-    "Hand",
-    "HandSource",
-    "KinematicTree",
-    "SelfCollision",
-    "find_hand",
-    "hand_of",
-    "hands_folder",
-    "load_hand",
-    "with_fingers",
-]
+    "ActuatedJoints", "Actuator", "CollisionSpheres", "Fingertips", "Hand", "HandSource", "KinematicTree",
+    "SelfCollision", "find_hand", "hand_of", "hands_folder", "load_hand", "with_fingers",
+]  # fmt: skip

@@ -55,9 +55,8 @@ class ActuatedJoints(Value):
     def check(self, joints: Tensor, name: str = "joints") -> None:
         """Raise `BadArgument` for joints of a wrong count, dtype or device, for NaN and for infinity."""
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
-            raise BadArgument(
-                name, f"shape {tuple(joints.shape)}", f"{len(self.names)} joints in the last axis: {self.names}"
-            )
+            allowed = f"{len(self.names)} joints in the last axis: {self.names}"
+            raise BadArgument(name, f"shape {tuple(joints.shape)}", allowed)
         if joints.dtype not in (torch.float32, torch.float64):
             raise BadArgument(name, str(joints.dtype), "torch.float32 or torch.float64")
         check_device(name, joints.device, "the hand", self.lower.device)
@@ -151,10 +150,8 @@ class Fingertips(Value):
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
         """Return the frames of all links of `chains`, and of the carriers, given all joints (j, n)."""
-        if len(values) != len(self.chains.joint_names):
-            raise BadArgument(
-                "values", f"{len(values)} joints", f"all {len(self.chains.joint_names)} joints of the URDF"
-            )
+        if len(values) != (every := len(self.chains.joint_names)):
+            raise BadArgument("values", f"{len(values)} joints", f"all {every} joints of the URDF")
         frames = self.chains.frames(values)
         return frames, frames.index_select(2, self.carrier)
 

@@ -74,9 +74,10 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     urdf = read_urdf(spec.urdf)
     _check_names(spec, urdf)
     _check_mimics_and_shapes(spec, urdf)
+    digest = hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()
     return Hand(
         name=spec.name,
-        source=HandSource(spec.option, urdf.path, _digest(spec, urdf), tuple(spec.options)),
+        source=HandSource(spec.option, urdf.path, digest, tuple(spec.options)),
         actuated=joints_from_files(spec, urdf),
         tree=tree_from_urdf(urdf),
         tips=tips_from_files(spec, urdf),
@@ -123,11 +124,6 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     if found.name != name:
         raise BadArgument("hand", found.name, f"{name}, for which the grasps were planned")
     return found
-
-
-def _digest(spec: HandSpec, urdf: Urdf) -> str:
-    """Return the SHA-256 of hand.toml and URDF together."""
-    return hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()
 
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:

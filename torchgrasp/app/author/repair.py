@@ -65,7 +65,10 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
     while True:
         links, parents = {x.name: x for x in urdf.links}, {j.parent for j in urdf.joints}
         for j in (j for j in urdf.joints if j.kind == "fixed"):
-            child, bare_root = links[j.child], j.parent == urdf.root and not _is_body(links[j.parent])
+            child, bare_root = (
+                links[j.child],
+                j.parent == urdf.root and not (links[j.parent].mass > 0 or links[j.parent].shapes),
+            )
             frame = not child.mass > 0 and (j.child in parents or not child.shapes)
             if frame or bare_root:
                 break
@@ -80,10 +83,6 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
             child.name: parent.name
         }
         urdf = dataclasses.replace(urdf, links=kept, joints=below)
-
-
-def _is_body(link: Link) -> bool:
-    return link.mass > 0 or bool(link.shapes)
 
 
 def _under(joint: Joint, above: Joint) -> Joint:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, STARTS_HELP, import_simulator, load_fingers
-from torchgrasp.app.report.evaluation import SHARE_NAMES, write_evaluation
+from torchgrasp.app.report.evaluation import SHARE_NAMES, list_figures, write_evaluation
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
 from torchgrasp.checks import Count, Range, Seed
@@ -119,26 +119,15 @@ def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
 
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
-    """Print success rates, also for each group of objects, failures by stage, and computing time."""
+    """Print success rates, also for each group of objects, failures by stage, and the figures of the report."""
     rows = [(text, format_share(summary[key])) for key, text in SHARE_NAMES.items()]
     for name, group in summary["by_group"].items():
         rows += [(f"{name}: {text}", format_share(group[key])) for key, text in SHARE_NAMES.items()]
-    if summary["refused"]:
-        refused = f"{summary['refused']}: a failure of the best grasp, not of the grasps tried"
-        rows.append(("views without a grasp", refused))
     if len(summary["fingers"]) > 1:
         rows.append(("views by fingers", "; ".join(f"{n} {names}" for names, n in summary["fingers"].items())))
     for stage, reasons in summary["failures"].items():
         rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
-    print(f"\n{protocol}, {tried}\n{format_columns(rows, left={0, 1})}")
-    means = [summary[key] for key in ("force_n", "overlap_mm", "overlap_mm_max", "plan_cpu_s", "trial_cpu_s", "cpu_s")]
-    force, overlap, most, plan, trial, total = ("-" if mean is None else f"{mean:.2f}" for mean in means)
-    if summary["slip_mm"]:
-        (slip, farthest), (turn, widest) = summary["slip_mm"], summary["slip_deg"]
-        held = f"median {slip:.1f} mm and {turn:.1f} deg, 95 % below {farthest:.1f} mm and {widest:.1f} deg"
-        print(f"slip of held objects: {held}")
-    print(f"mean normal force of a finger {force} N, overlap at the grasp {overlap} mm (most {most} mm)")
-    print(f"CPU time {plan} s to plan on a view, {trial} s for a trial, {total} s in all")
+    print(f"\n{protocol}, {tried}\n{format_columns([*rows, *list_figures(summary)], left={0, 1})}")
 
 
 @arguments()

@@ -5,22 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, get_args
 
+from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
 from torchgrasp.checks import Count
 from torchgrasp.cloud import read_cloud
 from torchgrasp.cloud.agreement import check_agreement
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.export import (
-    format_graspgen,
-    format_grasps,
-    format_keyframes,
-    format_moveit,
-    format_trajectories,
-    grasps_from_joints,
-    read_foreign,
-    save_dexgraspbench,
-)
 from torchgrasp.export.foreign import Quaternion
 from torchgrasp.files import write_file
 from torchgrasp.hand.hand import Hand
@@ -31,10 +22,10 @@ from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 Unit = Literal["m", "cm", "mm"]
 TEXTS: dict[str, Callable[..., str]] = {
-    "json": format_grasps,
-    "mujoco": format_keyframes,
-    "moveit": format_moveit,
-    "ros2": format_trajectories,
+    "json": formats.format_grasps,
+    "mujoco": formats.format_keyframes,
+    "moveit": formats.format_moveit,
+    "ros2": formats.format_trajectories,
 }
 """Formats of one text file without the name of the object."""
 
@@ -73,9 +64,9 @@ class Export(Command):
         with naming(hand="--format"):
             if self.format == "dexgraspbench":
                 stiffness = {} if self.kp is None else {"kp": self.kp}
-                save_dexgraspbench(hand, best, self.out, str(self.object), self.force, **stiffness)
+                formats.save_dexgraspbench(hand, best, self.out, str(self.object), self.force, **stiffness)
             elif self.format == "graspgen":
-                write_file(self.out, format_graspgen(best, str(self.object)))
+                write_file(self.out, formats.format_graspgen(best, str(self.object)))
             else:
                 write_file(self.out, TEXTS[self.format](hand, best, self.force, self.kp))
         print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
@@ -125,11 +116,11 @@ class Import(Command):
     def _read(self, hand: Hand, quaternion: Quaternion, unit: Unit) -> Grasps:
         """Read the grasps and certify them."""
         with naming(path="FILE"):
-            joints, poses, opened = read_foreign(self.file, hand, self.joints, quaternion)
+            joints, poses, opened = formats.read_foreign(self.file, hand, self.joints, quaternion)
         poses[:, :3, 3] *= {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit]
         with naming(joints="FILE"):
             spec = ContactSpec(friction=self.friction, friction_margin=1.0)
-            return grasps_from_joints(hand, joints, poses, opened, spec, self.std)
+            return formats.grasps_from_joints(hand, joints, poses, opened, spec, self.std)
 
     def _check(self, hand: Hand, grasps: Grasps, cloud: PointCloud) -> None:
         """Refuse grasps that are elsewhere than the cloud; name the options with which they are on it."""

@@ -69,7 +69,7 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
             for name, n in reasons.items()
         ],
         notes=[(score.object, score.view, score.note) for score in scores if score.note],
-        figures=_figures(summary),
+        figures=list_figures(summary),
         success=success and (
             f"Predicted {success['predicted']:.0%}, passed {success['passed']:.0%}; expected calibration error "
             f"{success['error']:.2f}, Brier skill {success['skill']:.2f}, area under the curve {success['auc']:.2f}."
@@ -123,21 +123,22 @@ def _object_rows(
     return rows
 
 
-def _figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return table rows with mean forces, overlaps and computing times."""
+def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return table rows with counts, mean forces, overlaps, slips and computing times."""
     names = {
+        "refused": ("views without a grasp: a failure of the best grasp, not of the grasps tried", "d"),
+        "executable": ("executable grasps", "d"),
         "force_n": ("mean normal force of a finger [N]", ".2f"),
         "overlap_mm": ("overlap of hand and object at the grasp, mean [mm]", ".1f"),
         "overlap_mm_max": ("overlap of hand and object at the grasp, most [mm]", ".1f"),
+        "slip_mm": ("slip of held objects, median and 95 % quantile [mm]", ".1f"),
+        "slip_deg": ("turn of held objects, median and 95 % quantile [deg]", ".1f"),
         "plan_cpu_s": ("CPU time to plan on a view [s]", ".1f"),
         "trial_cpu_s": ("CPU time of a trial [s]", ".2f"),
         "cpu_s": ("CPU time in all [s]", ".0f"),
     }
-    rows = [
-        (text, "-" if summary[key] is None else format(summary[key], style)) for key, (text, style) in names.items()
-    ]
-    return [
-        ("views without a grasp", str(summary["refused"])),
-        ("executable grasps", str(summary["executable"])),
-        *rows,
-    ]
+    rows = []
+    for key, (text, style) in names.items():
+        found = summary[key] if isinstance(summary[key], tuple | list) else [summary[key]]
+        rows.append((text, ", ".join("-" if x is None else format(x, style) for x in found)))
+    return rows

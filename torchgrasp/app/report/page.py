@@ -3,7 +3,6 @@
 import base64
 import functools
 import math
-from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -165,11 +164,3 @@ def templates() -> "jinja2.Environment":
 def render(template: str, **values: Any) -> str:
     """Return a page from a template and values; values of type `markupsafe.Markup` are inserted as HTML."""
     return templates().get_template(template).render(values)
-
-
-def format_table(
-    heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Collection[int] = (), code: Collection[int] = ()
-) -> str:
-    """Return an HTML table; `numbers` and `code` are the indices of columns with numbers and code."""
-    module: Any = templates().get_template("table.html").module
-    return module.table(heads, rows, numbers, code)
