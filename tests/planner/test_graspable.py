@@ -4,12 +4,16 @@ import dataclasses
 
 import pytest
 import torch
+import trimesh
 
 from tests.make import half_ball, see
 from torchgrasp import Status, load_hand, plan_scene
-from torchgrasp.cloud.camera import INTRINSICS
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.planner import ThingPlan
+from torchgrasp.planner.batches import rank
 from torchgrasp.planner.graspable import hand_span, is_vague, judge_things, order_by_ease
+from torchgrasp.planner.problem import Problem, Request, take_target
 from torchgrasp.scene import Scene
 
 HAND = load_hand("allegro")
@@ -94,6 +98,50 @@ def test_a_vague_shape_ends_the_planning_with_its_status(monkeypatch):
     monkeypatch.setattr("torchgrasp.planner.scene.is_vague", lambda shape: True)
     (thing,) = plan_scene(see(BOX), HAND, starts=10).things
     assert thing.status is Status.TOO_VAGUE and thing.reason == thing.status.sentence and thing.grasps is None
+
+
+def see_box(size: tuple[float, float, float], x: float, y: float, distance: float = 0.7) -> Scene:
+    """Return the scene of a box on the table, and of a smaller one beside it."""
+    box, cube = trimesh.creation.box(size), trimesh.creation.box([0.05, 0.05, 0.03])
+    box.apply_translation([x, y, size[2] / 2])
+    cube.apply_translation([0.1, -0.12, 0.015])
+    camera = look_at(20.0, 45.0, distance)
+    depth, labels = render_depth([box, cube], camera)
+    return Scene.from_depth(depth, INTRINSICS, camera, labels=labels, table=0.0)
+
+
+BEYOND = {
+    "a bar of 1 m": lambda: see_box((0.06, 1.0, 0.06), 0.0, 0.0, 1.6),
+    "a bar of 1 m, cut off twice": lambda: see_box((0.06, 1.0, 0.06), 0.0, 0.0),
+    "a box of 1 m": lambda: see_box((1.0, 1.0, 0.06), 0.0, 0.55, 2.0),
+    "a box cut off by half, along": lambda: see_box((0.06, 0.24, 0.06), -0.12, 0.34),
+    "a box cut off by half, across": lambda: see_box((0.06, 0.06, 0.2), -0.11, 0.36),
+}
+
+
+def is_unknown(scene: Scene) -> bool:
+    """Return whether the success of a good grasp of the first object is unknown."""
+    problem = Problem.of(Request(take_target(scene.select(1), 0), HAND), HAND)
+    return bool(rank(problem, load_shipped_grasp("jug", "allegro")).success.isnan().all())
+
+
+@pytest.mark.filterwarnings("ignore:the border")
+@pytest.mark.parametrize("name", BEYOND)
+def test_what_no_trial_supports_has_a_status_or_an_unknown_success_and_comes_last(name):
+    scene = BEYOND[name]()
+    assert order_by_ease(scene) == [2, 1]
+    assert judge_things(scene, HAND)[1] is not Status.OK or is_unknown(scene)
+    assert not is_unknown(see(BOX))
+
+
+def test_a_heap_of_specks_costs_no_planning(monkeypatch):
+    scene = see(BOX)
+    tile = scene.pixels // 8
+    labels = torch.where(scene.labels == 0, 1 + tile[:, 0] % 5 + 5 * (tile[:, 1] % 6), 0) * (tile.sum(-1) % 9 == 0)
+    many = dataclasses.replace(scene, labels=labels * (torch.rand(len(labels)) < 0.02))
+    monkeypatch.setattr("torchgrasp.planner.scene._plan_thing", None)
+    plan = plan_scene(many, HAND)
+    assert len(plan.things) == 30 and {thing.status for thing in plan.things} == {Status.FEW_PIXELS}
 
 
 def test_a_distant_object_is_less_easy():

@@ -152,9 +152,13 @@ def is_known(shape: ShapeGP, grasps: Grasps, friction: float) -> Bool[Tensor, "g
     More friction than in the trials counts as known: it does not make a grasp worse.
     """
     tried = _read_model()["range"]
-    low, high = tried["half_size"]
-    alike = friction >= tried["least_friction"] and low <= shape.scale <= high
+    alike = friction >= tried["least_friction"] and tried["half_size"][0] <= shape.scale <= largest_known()
     return alike & (grasps.contacts.require_std().amax(1) <= tried["most_deviation"])
+
+
+def largest_known() -> float:
+    """Return the largest distance [m] from an object's centre to its surface, of objects whose success is known."""
+    return _read_model()["range"]["half_size"][1]
 
 
 def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:

@@ -12,6 +12,7 @@ from torchgrasp.errors import Status
 from torchgrasp.geometry.plane import to_upright, upright_frame
 from torchgrasp.geometry.support import find_table
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.ranking import largest_known
 from torchgrasp.scene.scene import Scene
 from torchgrasp.scene.segment import OVERHANG
 from torchgrasp.shape.gp import ShapeGP
@@ -119,27 +120,34 @@ def is_vague(shape: ShapeGP) -> bool:
 
 
 def order_by_ease(scene: Scene) -> list[int]:
-    """Return the labels of a scene's objects, the easiest first.
+    """Return the labels of a scene's objects, the easiest first; those whose success no trial supports come last.
 
     An object is easy if it is tall, has free space around it, and has nothing above it; and if the camera is so near
-    that its pixels are smaller than a contact, and sees more of it than fingertips cover.
+    that its pixels are smaller than a contact, and sees more of it than fingertips cover. No trial supports an object
+    that is larger than those in the trials, or cut off by the border of the image.
     """
     from scipy.spatial import KDTree
 
     room, height, side = 0.06, 0.08, 0.01  # [m] more room or height makes nothing easier; side of a column of points
-    points, labels, ease = *(x.numpy() for x in _stand_upright(scene)), {}
-    column = np.unique(np.floor(points[:, :2] / side), axis=0, return_inverse=True)[1].reshape(-1)
+    points, labels, rank = *(x.numpy() for x in _stand_upright(scene)), {}
+    cells = np.floor(points / (side / 2)).astype(np.int64)
+    some = np.unique(((cells + 2**15) @ (1, 2**16, 2**32)) * (labels.max(initial=0) + 1) + labels, return_index=True)[1]
+    points, labels, column = points[some], labels[some], (cells[some, :2] // 2) @ (1, 2**16)
+    column = np.unique(column, return_inverse=True)[1]
     for label in scene.things:
         own, others = points[labels == label], labels != label
-        gap = KDTree(points[others]).query(own, distance_upper_bound=room)[0].min() if others.any() else room
+        near = others & (np.abs(points - own.mean(0)) < np.ptp(own, 0) + room).all(1)
+        gap = KDTree(points[near]).query(own, distance_upper_bound=room)[0].min() if near.any() else room
         top = np.full(column.max() + 1, np.inf)
         np.minimum.at(top, column[labels == label], own[:, 2])
         above = np.unique(column[others & (points[:, 2] > top[column] + side)])
         covered = len(above) / len(np.unique(column[labels == label]))
         own_height = np.quantile(own[:, 2], 0.95) if scene.table is not None else height
-        pixel = float(scene.image.depth[tuple(scene.pixels[scene.labels == label].T)].median())
-        pixel /= float(scene.image.intrinsics[0, 0])
-        seen = len(own) * pixel**2 / (3 * math.pi * TIP_RADIUS**2)
+        pixels = scene.pixels[scene.rows_of(label)]
+        pixel = float(scene.image.depth[tuple(pixels.T)].median()) / float(scene.image.intrinsics[0, 0])
+        seen = len(pixels) * pixel**2 / (3 * math.pi * TIP_RADIUS**2)
         clear = min(FLAT_RADII[0] / pixel, 1.0) + min(seen, 1.0)
-        ease[label] = min(gap / room, 1.0) + min(own_height / height, 1.0) - min(5.0 * covered, 1.0) + clear
-    return sorted(ease, key=lambda label: -ease[label])
+        ease = min(gap / room, 1.0) + min(own_height / height, 1.0) - min(5.0 * covered, 1.0) + clear
+        radius = np.linalg.norm(own - (own.min(0) + own.max(0)) / 2, axis=1).max()
+        rank[label] = (radius > largest_known() or scene.image.at_border(pixels), -ease)
+    return sorted(rank, key=rank.__getitem__)

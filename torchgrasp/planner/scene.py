@@ -79,7 +79,8 @@ def plan_scene(
     """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
     Objects that the hand cannot grasp by what the picture shows are not planned (`Status.FEW_PIXELS` to `TOO_VAGUE`).
-    Of the others, near and tall objects with free space around them are planned first.
+    Of the others, near and tall objects with free space around them are planned first, and objects whose success no
+    trial supports last.
 
     Args:
         scene: objects on a table.

@@ -60,6 +60,12 @@ class DepthImage(Value):
         camera = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
         return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
 
+    def at_border(self, pixels: Int[Tensor, "n 2"]) -> bool:
+        """Return whether pixels (row, column) of an object reach the border of the camera's image."""
+        last = torch.tensor(self.depth.shape, device=pixels.device) - 1
+        reaching = ((pixels <= 1) | (pixels >= last - 1)).any(-1)
+        return self.bounded and int(reaching.sum()) >= 5  # fewer are noise
+
     def without_speckle(self) -> "DepthImage":
         """Return the image with the median of the measured pixels of each 3 x 3 square where most are measured."""
         depth = self.depth.numpy()

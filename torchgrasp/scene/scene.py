@@ -213,9 +213,7 @@ class Scene(Value):
             f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
             for plane in self.others
         ]
-        pixels, last = self.pixels[self.rows_of()], torch.tensor(self.image.depth.shape) - 1
-        at_border = ((pixels <= 1) | (pixels >= last - 1)).any(-1)
-        if self.image.bounded and int(at_border.sum()) >= 5:  # fewer are noise
+        if self.image.at_border(self.pixels[self.rows_of()]):
             found.append(
                 "the target is cut off at the border of the image: its other part is unknown; turn the camera to it"
             )
