@@ -1,5 +1,6 @@
 """Certificates of random contacts, many at the border of closure, against rational arithmetic; and their speed."""
 
+from collections import Counter
 from fractions import Fraction
 from itertools import combinations
 
@@ -27,67 +28,59 @@ def certificates(o: Options) -> list[Row]:
 
 def bench_certificates(fingertips: int, grasps: int, seed: int) -> list[Row]:
     """Certify random contacts, half of them at the border of closure, and prove every verdict in exact arithmetic."""
-    generator = torch.Generator().manual_seed(seed)
-    each = grasps // len(FRICTIONS)
-    counts = {"closed": 0, "open": 0, "degenerate": 0}
-    wrong, worst = 0, 0.0
-    bound, sampled, aside = Fraction(MIN_MARGIN), 0, 0
-    nearest: list[float] = []
+    generator, each = torch.Generator().manual_seed(seed), grasps // len(FRICTIONS)
+    counts, margins, nearest = Counter[str](), list[tuple[float, float]](), list[float]()
     for friction, edges in tqdm(list(zip(FRICTIONS, EDGES, strict=True)), desc="frictions", disable=None, leave=False):
         spec = ContactSpec(friction=friction, edges=edges, friction_margin=1.0)
         contacts = border_contacts(each, fingertips, spec, generator)
         certificate = certify(contacts, spec)
-        phi, _ = solve_closure_lp(
-            wrenches(contacts.points, contacts.normals, spec.planned_friction, edges).flatten(1, 2)
-        )
+        matrices = wrenches(contacts.points, contacts.normals, spec.planned_friction, edges).flatten(1, 2)
+        phi, _ = solve_closure_lp(matrices)
         nearest.append(float((certificate.margin - MIN_MARGIN).abs().median()))
         for i in range(each):
             points, normals = contacts.points[i].numpy(), contacts.normals[i].numpy()
-            if not certificate.closed[i] and certificate.margin[i] >= MIN_MARGIN:
-                counts["degenerate"] += 1
-                wrong += not has_low_rank(points, normals, friction, edges)
+            margin, closed = float(certificate.margin[i]), bool(certificate.closed[i])
+            if not closed and margin >= MIN_MARGIN:
+                counts.update(degenerate=1, wrong=not has_low_rank(points, normals, friction, edges))
                 continue
             matrix = wrench_matrix(points, normals, friction, edges)
-            if certificate.closed[i]:
-                counts["closed"] += 1
-                wrong += not proves_margin_above(matrix, phi[i].numpy(), bound)
+            if closed:
+                counts.update(closed=1, wrong=not proves_margin_above(matrix, phi[i].numpy(), Fraction(MIN_MARGIN)))
             else:
-                counts["open"] += 1
-                wrong += not proves_margin_below(matrix, certificate.witness[i].numpy(), bound)
-            if i % 50 == 0 and torch.isfinite(certificate.margin[i]):
+                witness = certificate.witness[i].numpy()
+                counts.update(open=1, wrong=not proves_margin_below(matrix, witness, Fraction(MIN_MARGIN)))
+            if i % 50 == 0 and np.isfinite(margin):
                 try:
-                    exact = float(exact_margin(matrix))
+                    margins.append((float(exact_margin(matrix)), margin))
                 except ArithmeticError:
-                    aside += 1
-                    continue
-                sampled += 1
-                worst = max(worst, abs(exact - float(certificate.margin[i])))
-    total = sum(counts.values())
+                    counts["aside"] += 1
+    return [_proof_row(fingertips, counts, margins, nearest), _speed_row(fingertips, generator)]
+
+
+def _proof_row(fingertips: int, counts: Counter[str], margins: list[tuple[float, float]], nearest: list[float]) -> Row:
+    """Return how many verdicts are wrong, and the largest difference of a margin from the exact one."""
+    worst = max((abs(exact - margin) for exact, margin in margins), default=0.0)
+    verdicts = {kind: counts[kind] for kind in ("closed", "open", "degenerate")}
+    what = f"certificates: {sum(verdicts.values())} rows of {fingertips} contacts at 10 frictions, half near the border"
+    measured = (
+        f"{counts['wrong']} wrong ({', '.join(f'{count} {kind}' for kind, count in verdicts.items())}); margins of "
+        f"{len(margins)} against an exact programme: largest difference {worst:.1e}; {counts['aside']} more have no "
+        "feasible basis among the coefficients that HiGHS leaves"
+    )
+    numbers = {"counts": dict(counts), "worst": worst, "median_from_border": nearest}
+    return Row(f"{what}, in exact arithmetic", "0 wrong", measured, counts["wrong"] == 0 and worst < 1e-7, numbers)
+
+
+def _speed_row(fingertips: int, generator: torch.Generator) -> Row:
+    """Return how many certificates are made in a second."""
     spec = ContactSpec(friction=0.5, friction_margin=1.0)
     contacts = random_contacts(10_000, generator, fingertips=fingertips)
     fast = least_seconds(lambda: certify(contacts, spec)) / len(contacts)
     matrices = wrenches(contacts.points[:100], contacts.normals[:100], 0.5, 8).flatten(1, 2).numpy()
     slow = least_seconds(lambda: [solve_by_highs(m) for m in matrices], 3) / len(matrices)
-    return [
-        Row(
-            f"certificates: {total} rows of {fingertips} contacts at 10 frictions, half within 1e-3 of the border, "
-            "in exact arithmetic",
-            "0 wrong",
-            f"{wrong} wrong ({counts['closed']} closed, {counts['open']} open, {counts['degenerate']} lack rank); "
-            f"margins of {sampled} against an exact programme: largest difference {worst:.1e}; {aside} more have "
-            "no feasible basis among the coefficients that HiGHS leaves",
-            wrong == 0 and worst < 1e-7,
-            {"wrong": wrong, "counts": counts, "worst": worst, "aside": aside, "median_from_border": nearest},
-        ),
-        Row(
-            f"certificates of {fingertips} contacts per second, 10^4 at once, one thread, against one HiGHS programme "
-            "after the other",
-            ">= 20000",
-            f"{1 / fast:.0f} against {1 / slow:.0f} per second: {slow / fast:.0f}x",
-            fast <= 5e-5,
-            {"seconds": fast, "highs_seconds": slow},
-        ),
-    ]
+    what = f"certificates of {fingertips} contacts per second, 10^4 at once, one thread, against HiGHS one by one"
+    measured = f"{1 / fast:.0f} against {1 / slow:.0f} per second: {slow / fast:.0f}x"
+    return Row(what, ">= 20000", measured, fast <= 5e-5, {"seconds": fast, "highs_seconds": slow})
 
 
 def random_contacts(count: int, generator: torch.Generator, lean: float = 0.45, fingertips: int = 3) -> Contacts:

@@ -224,11 +224,8 @@ def clear_scene(
             break
         finally:
             spent += time.process_time() - started
-        ready = [
-            (thing.label, thing.grasps)
-            for thing in plan.things
-            if thing.grasps is not None and failed[left[thing.label - 1]] < TRIES
-        ]
+        open_things = [x for x in plan.things if failed[left[x.label - 1]] < TRIES]
+        ready = [(x.label, x.grasps) for x in open_things if x.grasps is not None]
         if not ready:
             reason = "; ".join(dict.fromkeys(thing.reason for thing in plan.things if thing.reason))
             break
@@ -240,8 +237,13 @@ def clear_scene(
         failed[left[label - 1]] += 1
         left = [left[i] for i in keep]
         if left and len(tries) < most:
-            motion = torch.from_numpy(result.motion)
-            rest = torch.eye(4, dtype=torch.float64).expand_as(motion)
-            placed = settle(placed, rest if result.status is Status.UNSTABLE else motion, keep)
-            placed = aim(placed, generator) or placed
+            placed = _look_again(placed, result, keep, generator)
     return SceneScore(names, tuple(tries), tuple(names[i] for i in left), reason, spent)
+
+
+def _look_again(placed: PlacedScene, result: Try, keep: Sequence[int], generator: torch.Generator) -> PlacedScene:
+    """Return the objects that are left, at rest after a try, before another camera."""
+    motion = torch.from_numpy(result.motion)
+    rest = torch.eye(4, dtype=torch.float64).expand_as(motion)
+    placed = settle(placed, rest if result.status is Status.UNSTABLE else motion, keep)
+    return aim(placed, generator) or placed

@@ -1,8 +1,10 @@
 """From a depth image to its table, to the object at a clicked pixel, and to all things in a room."""
 
 import dataclasses
+import itertools
 import math
 import time
+from collections import Counter
 
 import torch
 from jaxtyping import Int
@@ -98,27 +100,17 @@ def click(o: Options) -> list[Row]:
     """Measure the points of the object at a clicked pixel: the share that is found, and the share of other points."""
     meshes, scenes, seed = read_meshes(o.objects[0]), o.times(300), o.seed
     generator = torch.Generator().manual_seed(seed)
-    rows, seconds, i = [], [], 0
-    progress = tqdm(total=scenes, desc="click", disable=None, leave=False)
-    while len(rows) < scenes:
-        i += 1
-        picture = take_picture(meshes, seed + i, "apart")
-        chosen = choose_pixel(picture, generator)
-        if chosen is None:
-            continue
-        began = time.process_time()
-        try:
-            found = Scene.from_depth(picture.depth, INTRINSICS, picture.camera_pose, point=chosen[1])
-            pixels = found.pixels[found.rows_of()]
-        except BadArgument:
-            pixels = torch.empty(0, 2, dtype=torch.long)
-        seconds.append(time.process_time() - began)
-        own = picture.labels[pixels[:, 0], pixels[:, 1]] == chosen[0]
-        true = int(((picture.labels == chosen[0]) & (picture.depth > 0)).sum())
-        rows.append((seed + i, chosen[0], int(own.sum()) / true, int((~own).sum()) / max(1, len(own))))
-        progress.update()
-    progress.close()
-    share, others = ([row[k] for row in rows] for k in (2, 3))
+    rows, seconds, pictures = [], [], (take_picture(meshes, seed + i, "apart") for i in itertools.count(1))
+    with tqdm(total=scenes, desc="click", disable=None, leave=False) as progress:
+        while len(rows) < scenes:
+            picture = next(pictures)
+            chosen = choose_pixel(picture, generator)
+            if chosen is not None:
+                *shares, spent = click_on(picture, *chosen)
+                rows.append(shares)
+                seconds.append(spent)
+                progress.update()
+    share, others = zip(*rows, strict=True)
     mean_share, mean_others = sum(share) / scenes, sum(others) / scenes
     both = sum(s >= 0.95 and o <= 0.02 for s, o in zip(share, others, strict=True)) / scenes
     return [
@@ -137,6 +129,20 @@ def click(o: Options) -> list[Row]:
             {"seconds": seconds},
         ),
     ]
+
+
+def click_on(picture: Picture, label: int, pixel: tuple[int, int]) -> tuple[float, float, float]:
+    """Return which share of the object's points is found, the share of other points, and the CPU time [s]."""
+    began = time.process_time()
+    try:
+        found = Scene.from_depth(picture.depth, INTRINSICS, picture.camera_pose, point=pixel)
+        pixels = found.pixels[found.rows_of()]
+    except BadArgument:
+        pixels = torch.empty(0, 2, dtype=torch.long)
+    spent = time.process_time() - began
+    own = picture.labels[pixels[:, 0], pixels[:, 1]] == label
+    true = int(((picture.labels == label) & (picture.depth > 0)).sum())
+    return int(own.sum()) / true, int((~own).sum()) / max(1, len(own)), spent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,44 +212,40 @@ def _fate(labels: Int[Tensor, "h w"], true: Tensor) -> str:
 def look_around(o: Options) -> list[Row]:
     """Measure what is understood of rooms with edges, floors, walls, bins, shelves and boards, by four cameras."""
     scenes = range(o.seed, o.seed + o.times(len(KINDS) * 8))
-    pictures = (rooms(i) for i in tqdm(scenes, desc="rooms", disable=None, leave=False))
-    seen = [(room, understand(room)) for room in pictures]
-    fates = [fate for _, one in seen for fate in one.lone.values()]
+    seen = [(room, understand(room)) for room in map(rooms, tqdm(scenes, desc="rooms", disable=None, leave=False))]
+    fates = Counter(fate for _, one in seen for fate in one.lone.values())
     wrong = [f"{room.kind} {room.sensor}" for room, one in seen if not one.right]
-    extra = [part for _, one in seen for part, _ in one.extra]
+    extra = Counter(part for _, one in seen for part, _ in one.extra)
     seconds = sorted(one.seconds for _, one in seen)
-    right, offered = len(seen) - len(wrong), sum(one.offered for _, one in seen)
-    where = f"{len(seen)} rendered rooms, RealSense, Kinect v1, Azure Kinect, Zivid"
-    numbers = [
-        (i, room.kind, room.sensor, dataclasses.asdict(one)) for i, (room, one) in zip(scenes, seen, strict=True)
-    ]
+    median, offered = seconds[len(seconds) // 2], sum(one.offered for _, one in seen)
+    found = {i: (room.kind, room.sensor, dataclasses.asdict(one)) for i, (room, one) in zip(scenes, seen, strict=True)}
     return [
         Row(
-            f"table, {where}",
+            f"table, {len(seen)} rendered rooms, RealSense, Kinect v1, Azure Kinect, Zivid",
             "the first one within 2 degrees and 10 mm, all",
-            f"{right} first, {offered} offered; wrong: {', '.join(wrong) or 'none'}",
-            right == len(seen),
-            {"rooms": numbers},
+            f"{len(seen) - len(wrong)} first, {offered} offered; wrong: {', '.join(wrong) or 'none'}",
+            not wrong,
+            {"rooms": found},
         ),
         Row(
             "lone things in the rooms",
             "each is one thing, 98 %",
-            ", ".join(f"{fates.count(fate)} {fate}" for fate in ("one", "split", "joined", "missed")),
-            fates.count("one") >= 0.98 * len(fates),
-            {"fates": fates},
+            ", ".join(f"{fates[fate]} {fate}" for fate in ("one", "split", "joined", "missed")),
+            fates["one"] >= 0.98 * fates.total(),
+            {"fates": dict(fates)},
         ),
         Row(
             "objects of more than 100 pixels that are no things",
             "none",
-            ", ".join(f"{extra.count(part)} {part}" for part in sorted(set(extra))) or "none",
+            ", ".join(f"{count} {part}" for part, count in sorted(extra.items())) or "none",
             not extra,
-            {"extra": extra},
+            {"extra": dict(extra)},
         ),
         Row(
             "depth image of 640 x 480 to scene in a room",
             "<= 0.5 s, median",
-            f"median {seconds[len(seconds) // 2]:.2f} s, largest {seconds[-1]:.2f} s",
-            seconds[len(seconds) // 2] <= 0.5,
+            f"median {median:.2f} s, largest {seconds[-1]:.2f} s",
+            median <= 0.5,
             {"seconds": seconds},
         ),
     ]

@@ -82,18 +82,28 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
         cloud: what the camera saw, before cleaning.
         seed: of the samples.
     """
+    generator, surface = np.random.default_rng(seed), extract_surface(shape, RESOLUTION).mesh()
+    points, normals = sample_mesh(mesh, SAMPLES, generator)
+    ours, _ = sample_mesh(surface, SAMPLES, generator)
+    ways = ((surface, points), (mesh, ours))
+    chamfer = sum(float((nearest_on_mesh(m, p)[0] - p).norm(dim=-1).mean()) for m, p in ways) / 2
+    face_on_table = (points[:, 2] < float(mesh.bounds[0, 2]) + TABLE_FACE) & (normals[:, 2] < -0.7)
+    row = _measure_true_surface(shape, surface, points[~face_on_table], normals[~face_on_table], cloud)
+    return row | {"chamfer_mm": 1e3 * chamfer} | _measure_sure_surface(shape, ours[shape.contains(ours)], mesh)
+
+
+def _measure_true_surface(
+    shape: ShapeGP,
+    surface: "trimesh.Trimesh",
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    cloud: PointCloud,
+) -> Row:
+    """Return the numbers of the seen and of the hidden part of the true surface, given by points and normals."""
     from scipy.spatial import KDTree
 
-    generator = np.random.default_rng(seed)
-    points, normals = sample_mesh(mesh, SAMPLES, generator)
-    whole = points
-    face_on_table = (points[:, 2] < float(mesh.bounds[0, 2]) + TABLE_FACE) & (normals[:, 2] < -0.7)
-    points, normals = points[~face_on_table], normals[~face_on_table]
     far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
-
-    edge = find_edges(points, normals)
-    surface = extract_surface(shape, RESOLUTION).mesh()
-    feet, _ = nearest_on_mesh(surface, points)
+    edge, (feet, _) = find_edges(points, normals), nearest_on_mesh(surface, points)
     error = torch.linalg.vector_norm(feet - points, dim=-1)
     # The surface may reach a little over the domain, where `predict` refuses.
     angle = _angle(unit(shape.jet(shape.normalise(feet)).gradient), normals)
@@ -104,27 +114,23 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
     ratio[inside] = estimate.distance.abs() / (shape.std_factor * estimate.variance.sqrt())
     row: Row = {}
     for name, where in (("seen", ~far), ("hidden", far)):
-        row |= {
-            f"{name}_median_mm": 1e3 * _quantile(error[where], 0.5),
-            f"{name}_p90_mm": 1e3 * _quantile(error[where], 0.9),
-            f"{name}_normal_deg": _quantile(angle[where], 0.5),
-            f"{name}_flat_deg": _quantile(angle[where & ~edge], 0.5),
-            f"{name}_edge_deg": _quantile(angle[where & edge], 0.5),
-        }
+        row |= {f"{name}_{key}": 1e3 * _quantile(error[where], q) for key, q in (("median_mm", 0.5), ("p90_mm", 0.9))}
+        parts = {"normal_deg": where, "flat_deg": where & ~edge, "edge_deg": where & edge}
+        row |= {f"{name}_{key}": _quantile(angle[part], 0.5) for key, part in parts.items()}
         row |= {f"{name}_within_{k}": _share(ratio[where] <= k) for k in (1, 2, 3)}
         row |= {f"{name}_raw_{k}": _share(shape.std_factor * ratio[where] <= k) for k in (1, 2, 3)}
-
-    ours, _ = sample_mesh(surface, SAMPLES, generator)
-    ways = ((surface, whole), (mesh, ours))
-    row["chamfer_mm"] = 1e3 * sum(float((nearest_on_mesh(m, p)[0] - p).norm(dim=-1).mean()) for m, p in ways) / 2
-    ours = ours[shape.contains(ours)]
-    estimate = shape.predict(ours)
-    sure = estimate.variance < SURE_VARIANCE
-    feet, true_normal = nearest_on_mesh(mesh, ours[sure])
-    row["sure_median_mm"] = 1e3 * _quantile(torch.linalg.vector_norm(feet - ours[sure], dim=-1), 0.5)
-    row["sure_normal_deg"] = _quantile(_angle(estimate.normal[sure], true_normal), 0.5)
-    row["sure_share"] = _share(sure)
     return row
+
+
+def _measure_sure_surface(shape: ShapeGP, points: Float[Tensor, "n 3"], mesh: "trimesh.Trimesh") -> Row:
+    """Return the numbers of the part of the estimated surface that is sure, given points of all of it."""
+    estimate = shape.predict(points)
+    sure = estimate.variance < SURE_VARIANCE
+    feet, true_normal = nearest_on_mesh(mesh, points[sure])
+    error = torch.linalg.vector_norm(feet - points[sure], dim=-1)
+    angle = _angle(estimate.normal[sure], true_normal)
+    numbers = 1e3 * _quantile(error, 0.5), _quantile(angle, 0.5), _share(sure)
+    return dict(zip(("sure_median_mm", "sure_normal_deg", "sure_share"), numbers, strict=True))
 
 
 def format_table(rows: Sequence[Row]) -> str:
