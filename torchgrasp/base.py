@@ -19,13 +19,7 @@ SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
 def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
-    """Apply a function to the tensors in the same field of several values; return the value of the results.
-
-    Nested values are mapped in the same way. Other fields are taken from the first value.
-
-    Raises:
-        BadArgument: a field holds a tensor in one value and None in another.
-    """
+    """Map the tensors in the same field of several values, nested too; other fields are those of the first value."""
 
     def merge(name: str, *found: Any) -> Any:
         if isinstance(found[0], Value):

@@ -190,11 +190,7 @@ NO_OPTIONS = ClosingOptions(wait=False, pose_estimate=False, palm_reach=0.0, sto
 
 
 def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptions:
-    """Return the components of a closing mode: `options`, or by default all that the mode has.
-
-    Raises:
-        BadArgument: options for a mode that has none.
-    """
+    """Return the components of a closing mode, by default all; raise `BadArgument` for a mode that has none."""
     if closing in ("uncertainty", "fixed"):
         return ClosingOptions() if options is None else options
     if options is not None:

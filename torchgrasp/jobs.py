@@ -100,10 +100,7 @@ def _run(
 def _run_pool(
     function: Callable[..., Result], waiting: deque[tuple[int, Task]], died: set[int], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Run tasks in one pool of worker processes, and yield results until all have ended or the pool is broken.
-
-    `waiting` holds index and task; unfinished tasks are put back. `died` holds the indices of tasks that died once.
-    """
+    """Run `waiting` tasks by index in one pool until all end or the pool breaks; `died` are those that died once."""
     try:
         from pebble import ProcessExpired, ProcessPool
     except ImportError as error:

@@ -17,10 +17,7 @@ from torchgrasp.limits import NAME_BYTES, PATH_BYTES, SHOWN_LETTERS
 
 
 class Range(NamedTuple):
-    """A range mark: numbers from `low` to `high` are allowed, both included. An error shows `words`.
-
-    Example: `Annotated[float, Range(0.0, 1.0)]`.
-    """
+    """A range mark: numbers from `low` to `high` are allowed, both included; an error shows `words`."""
 
     low: float
     high: float
@@ -28,10 +25,7 @@ class Range(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """A mark for a batch in a field: it must have as many rows as tensors with the axis `letter`.
-
-    Example: `Annotated[Contacts, Rows("g")]`.
-    """
+    """A mark for a batch in a field: it must have as many rows as tensors with the axis `letter`."""
 
     letter: str
 
@@ -92,10 +86,7 @@ def is_tensor(hint: Any) -> bool:
 
 
 def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool:
-    """Return whether a shape fits the axes of a jaxtyping annotation, and record the sizes of its letters.
-
-    The rule is jaxtyping's own, but jaxtyping forgets the letters at the end of each checked function.
-    """
+    """Return whether a shape fits jaxtyping's axes, and record the letters' sizes, which jaxtyping would forget."""
     for k in [k for k, axis in enumerate(axes) if axis[0] in "*."]:
         letter, end = axes[k].lstrip("*#"), len(shape) - (len(axes) - k - 1)
         if end < k:

@@ -72,10 +72,7 @@ class Field(NamedTuple):
 
 
 def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) -> Field:
-    """Read a JSON file in UTF-8 of at most `most` bytes; raise the error that `refuse` makes for any other file.
-
-    NaN and Infinity are not valid JSON, and no number of more than 4300 digits is read.
-    """
+    """Read a JSON file in UTF-8 of at most `most` bytes, without NaN; raise the error of `refuse` for other files."""
     data = read_bounded(path, most, allowed, refuse)
     try:
         value = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)

@@ -29,11 +29,7 @@ DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)  # dtypes in ou
 
 
 def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
-    """Write tensors and metadata as one safetensors file of a `kind`, such as "grasps".
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write tensors and metadata as one safetensors file of a `kind`; raise `OutputError` if this fails."""
     # as bytes, since a full disk then is an OSError, which save_file makes an error of its own
     return write_file(path, pack_tensors(kind, tensors, meta))
 
@@ -49,12 +45,7 @@ def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) ->
 def load_tensors(
     path: Path | str, kind: str, names: set[str], optional: Collection[str] = ()
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a safetensors file of a `kind` with the tensors `names`, and possibly some of `optional`.
-
-    Raises:
-        ModelFileError: the file is missing, malformed or larger than `TENSOR_FILE_BYTES`, has another kind, version or
-            tensors, or a number is not finite or beyond `LARGEST_NUMBER`.
-    """
+    """Read a safetensors file with tensors `names` and any of `optional`; raise `ModelFileError` for other files."""
     allowed = names.union(optional)
     refuse = functools.partial(ModelFileError, "path")
     check_file(path, TENSOR_FILE_BYTES, f"a safetensors file of kind {kind!r}", refuse)
@@ -83,19 +74,9 @@ def load_tensors(
 
 
 def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) -> tuple[SomeValue, dict[str, str]]:
-    """Read a value from a safetensors file in which each tensor has the name of its field, and the metadata.
+    """Read a value and metadata from a safetensors file of a `kind`; raise `ModelFileError` for other shapes or types.
 
-    The annotations of the fields give the tensors, whether they are optional, and their shapes. A letter in the shapes
-    has the same size in all fields.
-
-    Args:
-        path: the file.
-        kind: kind of the file, such as "grasps".
-        of: class of the value to return.
-        rest: values of fields that are not tensors; other such fields keep their defaults.
-
-    Raises:
-        ModelFileError: a file as in `load_tensors`, or a tensor of another shape or type.
+    The annotations of the fields name the tensors. `rest` gives fields that are no tensors; others keep their defaults.
     """
     fields = _tensor_fields(of)
     optional = {name for name, kinds in fields.items() if type(None) in kinds}

@@ -24,11 +24,7 @@ LOCK = ".lock"  # name of the lock file in a folder. It holds the process and ho
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
-    """Write a file atomically, text as UTF-8: readers find either the old content or the new one.
-
-    Args:
-        path: path of the file; its folder is created.
-        content: the content, or a function that writes the content into a given file object.
+    """Write a file atomically, text as UTF-8, or by a function that gets a file object; its folder is created.
 
     Raises:
         OutputError: the folder cannot be written, or the disk is full. Nothing half-written is left.
@@ -133,9 +129,7 @@ def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Create a folder and lock it against other runs; remove half-written files of an interrupted run.
-
-    A new folder that is still empty at the end is removed.
+    """Create a folder and lock it against other runs; remove what an interrupted run left half-written.
 
     Raises:
         OutputError: another run holds the lock, or the folder cannot be written.
@@ -147,22 +141,14 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[None]:
-    """Lock a file against other runs, by a lock file beside it; remove half-written files of an interrupted run.
-
-    Raises:
-        OutputError: another run holds the lock, or the file's folder cannot be written.
-    """
+    """Lock a file by a lock file beside it, and clean up, as `hold_folder` does for a folder."""
     with _hold("path", path, path.with_name(f".{path.name}{LOCK}")):
         _remove_parts(x for x in path.parent.glob(f".*{ENDING}") if x.name.startswith(f".{path.name}."))
         yield
 
 
 def begin_folder(path: Path, content: str, what: str) -> None:
-    """Write the file that describes a locked folder, or check that the folder already has the same file.
-
-    Raises:
-        OutputError: the folder holds other content of the kind `what`, or other files.
-    """
+    """Write the file that describes a locked folder; raise `OutputError` if the folder holds other `what` or files."""
     folder = path.parent
     if path.exists():
         if path.read_text("utf-8", errors="replace") != content:

@@ -127,10 +127,7 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
 
 
 def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
-    """Return the boxes or the sphere of a shape, each as rotation, centre, half sizes and radius.
-
-    A cylinder becomes a prism, the union of six boxes that each reach from one side to the opposite side.
-    """
+    """Return rotation, centre, half sizes and radius of a shape's boxes or sphere; a cylinder becomes six boxes."""
     rotation = rotation_from_rpy(shape.rpy)
     if shape.kind == "sphere":
         return [(rotation, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]
@@ -145,9 +142,7 @@ def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, flo
 
 
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
-    """Return the pairs of links that collide in some of n random postures, but not in nearly all of them.
-
-    Every joint is uniform within its limits, so that the pairs suit all finger options. Neighbours are left out.
+    """Return the pairs of links, not neighbours, that collide in some of n random postures but not in nearly all.
 
     Raises:
         BadArgument: n outside [1, 10^7]; a coupling with joints that the URDF lacks.

@@ -78,10 +78,7 @@ class ActuatedJoints(Value):
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the actuated joints of the grasping fingers; raise `HandFileError` for joints without a range.
-
-    A joint of another finger is included if a joint of a grasping finger is coupled to it.
-    """
+    """Return the actuated joints and leaders of coupled ones; raise `HandFileError` for joints without a range."""
     movable = {j.name: j for j in urdf.movable}
     own = [j for f in spec.fingers for j in f.joints]
     leaders = [spec.coupling[j].source for j in own if j in spec.coupling]

@@ -188,10 +188,7 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
 
 
 def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
-    """Return the tree of a URDF as a chain of pytorch-kinematics; `<mimic>` joints are independent in it.
-
-    The chain is built from our URDF values, because the reader of pytorch-kinematics rounds angles to seven digits.
-    """
+    """Return a URDF as a chain of pytorch-kinematics, whose reader rounds angles; coupled joints are independent."""
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Link
     from pytorch_kinematics.frame import Joint as Mover

@@ -210,10 +210,7 @@ def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
 
 
 class BoxPairs(NamedTuple):
-    """Pairs of boxes, with axes as columns of `a` and `b`, half sizes `half_a` and `half_b` [m].
-
-    `gap` [m] is the vector from the centre of the first box to that of the second.
-    """
+    """Pairs of boxes: axes as columns of `a` and `b`, `gap` from the first centre to the second, half sizes [m]."""
 
     a: Float[Tensor, "3 3 k"]
     b: Float[Tensor, "3 3 k"]
@@ -224,9 +221,7 @@ class BoxPairs(NamedTuple):
     def along_axes(self) -> Float[Tensor, "15 k"]:
         """Return the separations [m] along the 15 candidate axes of two boxes (Gottschalk et al., 1996).
 
-        The axes are those of both boxes, then their cross products; the largest separation is that of the boxes. A
-        negative value is minus the shortest translation that separates the boxes. A positive value is a lower bound of
-        the distance, exact where a face or two crossing edges are nearest.
+        Own axes come first. The largest separation bounds the distance; below 0 it is minus the shortest way apart.
         """
         a, b, gap, half_a, half_b = self
         rotation = (a[:, :, None] * b[:, None]).sum(0)  # b's axes in the frame of a

@@ -83,10 +83,7 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A checked URDF: its links form one tree, and all numbers are finite.
-
-    `data` holds the bytes of the file, `xml` the bytes of the checked links and joints only.
-    """
+    """A checked URDF: `data` holds the bytes of the file, `xml` those of the checked links and joints only."""
 
     path: Path
     name: str
@@ -126,8 +123,7 @@ def read_urdf(path: Path | str) -> Urdf:
     """Read and check a URDF file that the library can use.
 
     Raises:
-        HandFileError: the file is missing, too large, hostile or not a tree of links; a mesh as a collision shape; a
-            joint without limits, or coupled to a joint that is coupled itself.
+        HandFileError: as `read_published`; a mesh as a shape, a joint without limits, or a chain of couplings.
     """
     urdf = read_published(path)
     for link in urdf.links:

@@ -34,11 +34,7 @@ Corners = tuple[np.ndarray, np.ndarray]
 
 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
-    """Return the path of a mesh file, which must lie in `folder`; `package://` means a path inside the folder.
-
-    Raises:
-        HandFileError: no such file in the folder, a file of another format, or a file that is too large.
-    """
+    """Return the path of a mesh in `folder`, also for `package://`; raise `HandFileError` for all other files."""
     base, kinds = folder.resolve(), ", ".join(MESH_KINDS)
     refusal = urdf.wrong(f"mesh {name[:80]!r}", f"a mesh ({kinds}) of at most {MESH_BYTES >> 20} MiB inside {folder}")
     package = name.startswith("package://")
@@ -59,11 +55,7 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
 
 
 def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
-    """Return points [m] on each collision shape of every link, in the link's frame.
-
-    Raises:
-        HandFileError: a mesh is missing, outside the folder, too large or malformed.
-    """
+    """Return points [m] on each shape of every link, in the link's frame; raise `HandFileError` for unusable meshes."""
     names = {shape.file for link in urdf.links for shape in link.shapes if shape.kind == "mesh"}
     size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
     if size > HAND_MESH_BYTES:
@@ -99,11 +91,7 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
 
 
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
-    """Replace the shapes of a fingertip by a ball at its end, and boxes up to the ball's centre.
-
-    `outward` is the direction to the end of the finger, `points` lie on the tip. A tip shorter than 2.6 radii gets only
-    the ball.
-    """
+    """Replace a tip by a ball at its end, in direction `outward`, and boxes up to the ball unless the tip is short."""
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
     shapes = [Shape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]

@@ -42,11 +42,7 @@ class Guess(NamedTuple):
 def guess_pads(
     urdf: Urdf, frames: Float[Tensor, "3 4 _ n"], tips: Sequence[str], surfaces: Mapping[str, Points]
 ) -> Guess:
-    """Guess the fingertip pads and the direction out of the palm; `frames` are of tips and palm in random postures.
-
-    A tip with a single box, cylinder or sphere gets its pad on this shape. Another tip gets a ball that touches its
-    surface, given by points (n, 3) in `surfaces`.
-    """
+    """Guess pads and the direction out of the palm; `frames` are of tips and palm, `surfaces` the points on links."""
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
     tip_frames = frames[:, :, :-1]
@@ -80,11 +76,7 @@ def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
 
 
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
-    """Return the order of the tips: first the three whose pads face each other most often, then the others one by one.
-
-    A pad counts as facing the middle of the pads within 45 degrees and 1.5 to 8 cm, as for an object. `frames` are the
-    tips' frames in random postures.
-    """
+    """Return the order of the tips: the three whose pads face each other in most postures, then the next best ones."""
     contacts, normals = (torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal"))
     points, directions = map_points(frames, contacts), map_directions(frames, normals)
 

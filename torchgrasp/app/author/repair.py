@@ -56,11 +56,7 @@ def keep_below(urdf: Urdf, root: str) -> Step:
 
 
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
-    """Merge massless frames into the link to which they are fixed; also return the link of each merged frame.
-
-    A massless root takes over the link that is fixed to it. A last link with a shape is kept, because it may be a
-    fingertip.
-    """
+    """Merge massless frames, but last links with shapes, into the links to which they are fixed; also return which."""
     taken: dict[str, str] = {}
     while True:
         links, parents = {x.name: x for x in urdf.links}, {j.parent for j in urdf.joints}

@@ -187,10 +187,7 @@ def _sentence(error: GraspError) -> str:
 
 @contextlib.contextmanager
 def _open_streams() -> Iterator[None]:
-    """Replace standard streams that are missing, as in a daemon, by the null device.
-
-    Otherwise the first file that is opened gets the descriptor of a stream, and libraries print into the file.
-    """
+    """Replace missing standard streams by the null device, or the next open file would get their descriptors."""
     with contextlib.ExitStack() as stack:
         if None in (sys.stdin, sys.stdout, sys.stderr):
             while (free := os.open(os.devnull, os.O_RDWR)) <= 2:  # descriptors of the standard streams

@@ -49,10 +49,7 @@ def nested(default: Any) -> Any:
 
 
 def arguments(**names: str) -> Callable[[type[T]], type[T]]:
-    """Return a decorator that turns a class into a frozen dataclass whose fields are command-line arguments.
-
-    `names` maps the argument names in the library's errors to fields.
-    """
+    """Return a decorator of a command's class; `names` maps the argument names in the library's errors to fields."""
 
     def make(cls: type[T]) -> type[T]:
         made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)

@@ -107,10 +107,7 @@ class Canvas:
     def render_png(
         self, corners: Float[np.ndarray, "n 3"], direction: Direction, bar: tuple[str, float, str] | None = None
     ) -> bytes:
-        """Return a PNG that shows all `corners` [m], seen from a direction between 15 and 40 degrees above the table.
-
-        `bar` gives the title, the largest value and the colour map of a colour bar at the bottom.
-        """
+        """Return a PNG of all `corners` [m]; `bar` is title, largest value and colour map of a bar at the bottom."""
         from PIL import Image
 
         image = Image.fromarray(self.render(frame_camera(corners, direction, 0.09 if bar else 0.0)))

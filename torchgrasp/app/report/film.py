@@ -17,8 +17,8 @@ from torchgrasp.app.report.canvas import (
     encode_figure,
     frame_camera,
 )
-from torchgrasp.app.report.run import LOST, Moment, explain_loss, first_touches, moments_of, moved_in_hand, tick_of
-from torchgrasp.app.report.solids import link_poses, solids_of_links
+from torchgrasp.app.report.run import explain_loss, first_touches, moments_of, moved_in_hand, tick_of
+from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import to_array
 from torchgrasp.closure import ClosureResult
 from torchgrasp.geometry.frames import apply
@@ -33,14 +33,7 @@ LETTERS = "abcdef"  # names of the moments in stills and plots
 
 
 def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction) -> bytes:
-    """Draw the film strip of a closing on the true object; all pictures are in the hand's frame.
-
-    Args:
-        mesh: the true object [m], in the frame of the grasp, where z is up.
-        hand: the hand that closed.
-        closure: the result of the closing.
-        direction: direction from the object to the camera.
-    """
+    """Draw the film strip of a closing on the true object [m], which is in the frame of the grasp."""
     from matplotlib.figure import Figure
 
     moments = moments_of(closure, _centre(mesh), hand.tips.names)
@@ -54,7 +47,7 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
         axis.imshow(still, aspect="auto")
         axis.set_axis_off()
         title = f"{LETTERS[k]}  {float(closure.time[moment.tick]):.2f} s  {moment.name}"
-        axis.set_title(title, loc="left", x=0.04, color=_color(moment), fontsize=14)
+        axis.set_title(title, loc="left", x=0.04, color=moment.color, fontsize=14)
 
     figure.subplots_adjust(0.05, 60 / height, 0.985, 1 - (STILL + 62) / height, hspace=50 / float(np.mean(heights)))
     axes = figure.subplots(len(plots), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
@@ -63,7 +56,7 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
     for finger, tick in zip(closure.contact_order, first_touches(closure), strict=True):
         axes[0].plot(time[tick], 0.0, "^", color=FINGERS[finger], markersize=12, clip_on=False, zorder=3)
     for letter, moment in zip(LETTERS, moments, strict=False):
-        at, color = float(closure.time[moment.tick]), _color(moment)
+        at, color = float(closure.time[moment.tick]), moment.color
         for axis in axes:
             axis.axvline(at, color=color, linewidth=2 if color == ALARM else 1, clip_on=False)
         place = {"xy": (at, 1.0), "xycoords": axes[0].get_xaxis_transform(), "ha": "center"}
@@ -87,11 +80,6 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
     return f"In the order of touch: {order}. {end} Each picture is taken from the hand."
 
 
-def _color(moment: Moment) -> str:
-    """Return the colour for a moment's title and line."""
-    return ALARM if moment.name == LOST else INK
-
-
 def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:
     """Return the centre of mass of a mesh [m]."""
     return torch.tensor(np.array(mesh.center_mass), dtype=torch.float64)
@@ -108,23 +96,21 @@ def _draw_stills(
     """Return pictures of the hand and the object at the given ticks, all at the same scale."""
     finite = torch.nonzero(closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1))[:, 0]
     at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
-    links = to_array(link_poses(hand, closure.joints[at], closure.joint_names, closure.hand_pose[at]))
-    vertices = torch.tensor(np.array(mesh.vertices), dtype=torch.float64)
+    vertices, faces = torch.tensor(np.array(mesh.vertices), dtype=torch.float64), np.asarray(mesh.faces)
     places = to_array(apply(closure.object_pose[at].double(), vertices))
-    solids, faces = solids_of_links(hand), np.asarray(mesh.faces)
-    base = to_array(closure.hand_pose[at, :3, 3])
+    names, base = closure.joint_names, to_array(closure.hand_pose[at, :3, 3])
+    hands = [solids_from_hand(hand, closure.joints[t], names, closure.hand_pose[t]) for t in at]
     # The table is fixed, so it sinks in the pictures while the hand rises.
     table = float(apply(closure.object_pose[0].double(), vertices)[:, 2].min())
-    postures = [[s.vertices @ poses[s.link, :3, :3].T + poses[s.link, :3, 3] for s in solids] for poses in links]
     inside = [place - b for place, b in zip(places, base, strict=True)]
     near = [x for x in inside if np.abs(x.mean(0) - inside[0].mean(0)).max() < 0.25]  # a lost object is not framed
-    seen = np.concatenate([*near, *(x - b for parts, b in zip(postures, base, strict=True) for x in parts)])
+    seen = np.concatenate([*near, *(s.vertices - b for solids, b in zip(hands, base, strict=True) for s in solids)])
     pictures = []
-    for place, parts, poses, b in zip(places, postures, links, base, strict=True):
+    for place, solids, b in zip(places, hands, base, strict=True):
         canvas = Canvas()
         canvas.add_mesh(place, faces, OBJECT)
-        for solid, points in zip(solids, parts, strict=True):
-            canvas.add_mesh(points, solid.faces, solid.color, solid.normals @ poses[solid.link, :3, :3].T)
+        for solid in solids:
+            canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
         canvas.add_table(seen + b, table)
         pictures.append(canvas.render(frame_camera(seen + b, direction, size=size), size))
     return pictures

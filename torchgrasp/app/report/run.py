@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.app.report.canvas import ALARM, INK
 from torchgrasp.base import count_status
 from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
@@ -152,6 +153,11 @@ class Moment(NamedTuple):
     tick: int
     name: str
 
+    @property
+    def color(self) -> str:
+        """The colour of its title and line in the film strip."""
+        return ALARM if self.name == LOST else INK
+
 
 def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
     """Return which fingertips touch the object at each tick."""
@@ -182,12 +188,7 @@ def tick_of(closure: ClosureResult, phase: int) -> int:
 
 
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
-    """Return the tick at which the object was lost; None if it was held.
-
-    For EJECTED it is the first tick at which the object is too far from its place; for TOO_HEAVY the tick of greatest
-    height. Otherwise it is the tick at which fewer than two fingertips touch for the rest of the trial, or the object
-    has slipped too far in the hand, whichever is earlier.
-    """
+    """Return the tick at which the object was pushed away, put down, let go or slipped too far; None if it was held."""
     if closure.held:
         return None
     last, pressed = len(closure.time) - 1, tick_of(closure, 2)

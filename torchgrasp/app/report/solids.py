@@ -76,10 +76,7 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
 
 @functools.lru_cache(maxsize=512)  # a hand is drawn many times
 def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and normals of a collision shape with rounded edges, in the frame of its link.
-
-    The solid is the convex hull of balls, so the normals point away from the balls' centres.
-    """
+    """Return vertices, faces and normals of a shape with rounded edges, the hull of balls, in its link's frame."""
     from scipy.spatial import ConvexHull
     from trimesh import creation
     from trimesh.transformations import euler_matrix

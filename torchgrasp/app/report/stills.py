@@ -82,10 +82,7 @@ def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direct
 
 
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
-    """Draw a hand at a posture from two sides, at the lower and upper joint limits, and the ranges of the joints.
-
-    Arrows on the fingertips are their normals. The palm's axes x, y and z are red, green and blue.
-    """
+    """Draw a hand, its pads' normals and its palm's axes at a posture and at both limits, and the joints' ranges."""
     from matplotlib.figure import Figure
     from PIL import Image
 

@@ -192,10 +192,7 @@ def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
 def thin_mesh(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], most: int
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "g 3"]]:
-    """Return which vertices to keep and at most `most` faces between them.
-
-    All vertices in a cell of a grid are replaced by one of them; the cells grow until the faces are few enough.
-    """
+    """Return which vertices to keep, one in each cell of a grid so coarse that `most` faces remain, and the faces."""
     kept, thinned = np.arange(len(vertices)), faces
     cell = float(np.linalg.norm(np.ptp(vertices, axis=0))) / 256 if len(vertices) else 0.0
     while len(thinned) > most:
