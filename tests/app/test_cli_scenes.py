@@ -184,6 +184,13 @@ def test_a_target_that_is_lost_on_another_table_is_told(seen, tmp_path, planned,
     assert "every object is lost" in grasp_on("--table", "0.0")
 
 
+def test_what_the_picture_says_against_a_chosen_object_is_told_before_planning(seen, tmp_path, planned, grasp_on):
+    labels = np.where(np.cumsum(seen["labels"] == 2).reshape(seen["labels"].shape) <= 60, seen["labels"], 0)
+    np.savez(tmp_path / "s.npz", **seen | {"labels": labels})
+    assert f"advice  {Status.FEW_PIXELS.sentence}" in grasp_on("--label", "2") and planned[0].target == 2
+    assert "advice" not in grasp_on("--label", "1")
+
+
 BAD = {
     "no plane": (lambda a: {**a, "depth": a["depth"] * (a["labels"] == 1)}, [], "plane"),
     "empty mask": (lambda a: {**a, "labels": None, "mask": 0 * a["labels"]}, [], "mask"),

@@ -39,6 +39,7 @@ from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surfac
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.explain import explain_empty
+from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.problem import take_target
 from torchgrasp.planner.scene import plan_scene
@@ -181,7 +182,8 @@ class Grasp(Command):
         progress = Progress("scene", *["fingers"] * (among is not None), *STAGES, "report")
         with progress.bar, holding("--out", out):
             progress.end("scene", f"{len(scene.things)} objects, labels {', '.join(map(str, scene.things))}")
-            for sentence in scene.advice:
+            judged = Status.OK if scene.target is None else judge_things(scene, hand, spec)[scene.target]
+            for sentence in (*scene.advice, *([judged.sentence] if judged is not Status.OK else [])):
                 print(f"advice  {sentence}")
             options = {"fingers": among, "observer": progress.end}
             explanation = None
@@ -209,10 +211,9 @@ class Grasp(Command):
         image, name = scene.image, "--up" if self.view.table is None else "--table"
         table = None if self.view.table is None else self.view.plane(PointCloud(scene.points))
         supports = find_plausible(scene.points, image.obj_from_camera, table, self.view.vertical, known_unit=True)
-        labels = torch.zeros(image.depth.shape, dtype=torch.long)
-        labels[tuple(scene.pixels.T)] = scene.labels
-        labels = label_again(image, scene.table, supports[0], labels, scene.given, scene.target or 0)
-        labels = labels[tuple(scene.pixels.T)]
+        labels, place = torch.zeros(image.depth.shape, dtype=torch.long), tuple(scene.pixels.T)
+        labels[place] = scene.labels
+        labels = label_again(image, scene.table, supports[0], labels, scene.given, scene.target or 0)[place]
         planes, target = tuple(support.plane for support in supports), None if chosen else scene.target
         again = dataclasses.replace(scene, labels=labels, table=planes[0], others=planes[1:], target=target)
         if not again.things or target not in (None, *again.things):
@@ -233,9 +234,8 @@ class Grasp(Command):
             print(format_line((f"object {thing.label}", format_success(thing.success), text), (-10, 7, -1)), flush=True)
         progress.end("objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp")
         if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
-            print(f"The {hand.name} hand has no executable grasp of any object in the scene.")
-            print("With --label or --point, changes that would help are tried for one of them.")
-            return None
+            help = "With --label or --point, changes that would help are tried for one of them."
+            return print(f"The {hand.name} hand has no executable grasp of any object in the scene.\n{help}")
         return dataclasses.replace(scene, target=plan.best.label), plan.best.grasps, plan.best.shape
 
 
