@@ -120,19 +120,6 @@ def test_foreign_files_are_refused(tmp_path):
             load_tensors(tmp_path / name, "toy", {"a"})
 
 
-def test_unequal_rows_are_refused(tmp_path):
-    some_grasps(2).save(tmp_path / "f")
-    from safetensors import safe_open
-
-    with safe_open(tmp_path / "f", framework="pt") as file:
-        tensors = {k: file.get_tensor(k) for k in file.keys()}
-        meta = dict(file.metadata())
-    tensors["score"] = tensors["score"][:1].clone()
-    save_file(tensors, tmp_path / "f", metadata=meta)
-    with pytest.raises(ModelFileError, match="rows"):
-        load_grasps(tmp_path / "f")
-
-
 @pytest.mark.promise("F3")
 def test_a_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
     path = save_tensors(tmp_path / "f", "toy", {"a": torch.zeros(1)}, {})

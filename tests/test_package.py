@@ -1,5 +1,6 @@
 """What importing torchgrasp does and leaves alone, and what its source never contains."""
 
+import ast
 import importlib
 import inspect
 import pkgutil
@@ -11,8 +12,11 @@ from pathlib import Path
 
 import pytest
 
+import torchgrasp
+
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "torchgrasp").rglob("*.py"))
+PACKAGES = [found.name for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp.") if found.ispkg]
 
 
 def run(code, folder):
@@ -64,12 +68,6 @@ print("same")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_public_name_exists():
-    import torchgrasp
-
-    assert [name for name in torchgrasp.__all__ if not hasattr(torchgrasp, name)] == []
-
-
 @pytest.mark.promise("H4")
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_source_has_no_neural_network_pickle_or_global_random_state(path):
@@ -86,12 +84,7 @@ def test_source_has_no_neural_network_pickle_or_global_random_state(path):
 
 def public_names():
     """Every public name of the package and of its subpackages, with the object."""
-    import torchgrasp
-
-    packages = [torchgrasp]
-    for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp."):
-        if found.ispkg:
-            packages.append(importlib.import_module(found.name))
+    packages = [torchgrasp, *map(importlib.import_module, PACKAGES)]
     return {f"{p.__name__}.{name}": getattr(p, name) for p in packages for name in getattr(p, "__all__", ())}
 
 
@@ -127,11 +120,43 @@ def test_what_public_functions_take_is_public():
 
 
 def test_every_subpackage_names_its_public_things():
-    import torchgrasp
+    packages = [importlib.import_module(name) for name in PACKAGES]
+    silent = [package for package in packages if not getattr(package, "__all__", None)]
+    assert all("Not public." in (package.__doc__ or "") for package in silent), silent
 
+
+def test_every_public_function_has_an_example_that_calls_it():
+    """The doctests of the suite run all examples that stand in docstrings."""
     silent = []
-    for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp."):
-        package = importlib.import_module(found.name)
-        if found.ispkg and not getattr(package, "__all__", None) and "Not public." not in (package.__doc__ or ""):
-            silent.append(found.name)
+    for name, function in public_names().items():
+        lines = "\n".join(re.findall(r"^ *(?:>>>|\.\.\.) .*", function.__doc__ or "", re.MULTILINE))
+        if inspect.isfunction(function) and not re.search(rf"\b{function.__name__}\b", lines):
+            silent.append(name)
     assert silent == []
+
+
+PROMISES, NOT_PROMISED = (ROOT / "docs" / "promises.md").read_text().split("## Not promised")
+PROMISED = set(re.findall(r"^\| ([A-Z]\d+) \| ", PROMISES, re.MULTILINE))
+
+
+def marked() -> set[str]:
+    """Return the ids of promises that tests carry."""
+    found = set[str]()
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        for test in ast.parse(path.read_text()).body:
+            for mark in test.decorator_list if isinstance(test, ast.FunctionDef) else ():
+                if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.promise":
+                    found.update(map(ast.literal_eval, mark.args))
+    return found
+
+
+def test_every_promise_has_a_test_and_every_mark_a_promise():
+    assert marked() == PROMISED
+
+
+def test_every_id_is_promised_or_has_its_reason():
+    most = {"I": 13, "H": 6, "F": 9, "L": 7, "N": 16}
+    known = {f"{letter}{k}" for letter in most for k in range(1, most[letter] + 1)}
+    reasons = re.findall(r"^\| ([A-Z])(\d+)(?: to [A-Z](\d+))? \|", NOT_PROMISED, re.MULTILINE)
+    told = {f"{letter}{k}" for letter, first, last in reasons for k in range(int(first), int(last or first) + 1)}
+    assert PROMISED | told == known and not PROMISED & told

@@ -9,7 +9,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
+from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -106,3 +108,17 @@ def test_every_file_the_readme_names_exists():
     links = re.findall(r"\]\(([^)#:]+)\)", README)
     assert [p for p in links if not (ROOT / p).exists()] == []
     assert "docs/overview.png" in links
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")  # of the kernel's own
+def test_the_notebook_runs_to_its_last_cell_and_is_stored_without_what_it_printed(monkeypatch):
+    pytest.importorskip("sapien")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    notebook = nbformat.read(ROOT / "examples" / "tutorial.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells)
+    NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert not any(output["output_type"] == "error" for output in outputs)
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+    assert outputs[-1]["text"].startswith("True")

@@ -181,7 +181,7 @@ def test_a_shipped_mesh_comes_with_its_parts_wherever_it_lies(tmp_path):
 
 def test_grasp_writes_grasps_and_pages_for_a_shipped_object_by_name(tmp_path, run_command, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, out, err = run_command("grasp", "cylinder", "--hand", "barrett", "--starts", "60")
+    code, out, err = run_command("grasp", "cylinder", "--hand", "barrett", "--starts", "20")
     assert err == ""  # no bar where there is no terminal
     for stage in ("cloud", "shape", "plan", "certify", "query", "refine", "report"):
         assert any(line.startswith(stage) for line in out.splitlines())
@@ -209,7 +209,7 @@ def test_help_lists_every_command_in_a_chapter(run_command):
 
 
 def test_an_empty_result_names_what_would_help(tmp_path, run_command):
-    options = ["--starts", "10", "--friction", "0", "--table", "0", "--no-report"]
+    options = ["--starts", "5", "--friction", "0", "--table", "0", "--no-report"]
     code, out, _ = run_command("grasp", VIEW, "--hand", "barrett", "--out", tmp_path, *options)
     assert code == 1 and [p.name for p in tmp_path.iterdir()] == ["grasps.safetensors"]
     assert any(line.startswith("change") and "executable" in line for line in out.splitlines())

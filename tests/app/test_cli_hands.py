@@ -21,6 +21,12 @@ def barrett(tmp_path):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def few_starts(monkeypatch):
+    """Try a hand with little work."""
+    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 12)
+
+
 def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys):
     (barrett / "hand.toml").unlink()
     assert main(["hand", "new", str(barrett / "hand.urdf"), "--name", "mine"]) == 0
@@ -107,7 +113,7 @@ def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_pat
     assert "the hand can grasp" in capsys.readouterr().out
 
 
-def test_hand_check_prints_warnings_with_their_fixes(claw, capsys):
+def test_hand_check_prints_warnings_with_their_fixes(claw, capsys, monkeypatch):
     """A pad that faces away, and a link that is always in another's way."""
     text = claw.read_text().replace('<box size="0.016 0.02 0.056"/>', '<box size="0.055 0.055 0.056"/>')
     claw.write_text(text)
@@ -117,6 +123,7 @@ def test_hand_check_prints_warnings_with_their_fixes(claw, capsys):
     away = pad.replace("0.866025403784", "-0.866025403784").replace("0.009526279442", "-0.009526279442")
     assert away != pad
     toml.write_text(toml.read_text().replace(pad, away))
+    monkeypatch.setattr("torchgrasp.app.cli.hands._try_objects", lambda hand, bar: False)
     main(["hand", "check", str(claw.parent), "--out", str(claw.parent / "hand.png")])
     said = capsys.readouterr().out
     assert "warning: default: only" in said and "warning: default: the pad of left faces" in said
@@ -124,7 +131,6 @@ def test_hand_check_prints_warnings_with_their_fixes(claw, capsys):
 
 def test_every_set_of_fingers_is_checked_and_tried(tmp_path, capsys, monkeypatch):
     """A draft of the Allegro hand has two; a fault of a further one is named, and four fingers are described."""
-    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 15)
     assert main(["hand", "new", str(hands_folder() / "allegro" / "hand.urdf"), "--out", str(tmp_path / "mine")]) == 0
     assert re.search(r"default +[\w, ]*thumb\nfour +index, middle, ring, thumb\n", capsys.readouterr().out)
     words = ["hand", "check", str(tmp_path / "mine"), "--out", str(tmp_path / "hand.png")]

@@ -75,7 +75,7 @@ def hand() -> Hand:
 
 @pytest.fixture(scope="session")
 def grasps(hand: Hand) -> Grasps:
-    found = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=25)
+    found = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=12)
     assert len(found[found.status == 0]) > 1
     return found[found.status == 0][:2]
 

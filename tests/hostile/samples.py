@@ -16,7 +16,8 @@ from jaxtyping import AbstractArray
 from torch import Tensor
 
 import torchgrasp
-from torchgrasp import PointCloud, fit_shape, load_hand, load_object, load_scene
+from tests.make import see
+from torchgrasp import PointCloud, fit_shape, load_hand, load_object
 from torchgrasp.checks import Range
 from torchgrasp.cloud import estimate_normals
 from torchgrasp.control import ClosingReference, GraspController, no_contact, observe
@@ -61,7 +62,7 @@ def special(kind: type) -> Any:
     nine = GaussianMixture(torch.ones(1), torch.zeros(1, 9), torch.eye(9)[None], NAMES)
     made = {
         torchgrasp.Hand: lambda: load_hand("barrett"),
-        torchgrasp.Scene: load_scene,
+        torchgrasp.Scene: lambda: see((0.0, 0.0, 0.06, 0.1)),
         torchgrasp.data.GraspObject: lambda: load_object("cylinder"),
         PointCloud: few_points,
         Grasps: lambda: load_shipped_grasp("jug", "barrett"),

@@ -1,44 +1,20 @@
-"""A command that is told to end: what it held is let go, and its exit code says why."""
+"""A command that is told to end lets go of what it held and says why; standard streams may be full or closed."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tests.make import start_process
-
-WAITING = """
-import sys, time
-from pathlib import Path
 from torchgrasp.app import cli
-from torchgrasp.files import hold_folder
 
-def wait(out: Path) -> int:
-    with hold_folder(out):
-        print("ready", flush=True)
-        time.sleep(600)
-    return 0
-
-cli.COMMANDS["wait"] = wait
-cli.run_and_exit()
-"""
-
-
-@pytest.mark.promise("F6")
-@pytest.mark.parametrize(("sign", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
-def test_a_command_that_is_told_to_end_says_so_and_leaves_nothing(tmp_path: Path, sign: str, code: int, said: str):
-    command = [sys.executable, "-c", WAITING, "wait", "--out", str(tmp_path / "out")]
-    run = start_process(command, stdout=subprocess.PIPE)
-    assert run.stdout is not None and run.stdout.readline() == "ready\n"
-    run.send_signal(getattr(signal, sign))
-    _, told = run.communicate()
-    assert (run.returncode, told) == (code, f"torchgrasp: {said}\n")
-    assert list(tmp_path.iterdir()) == []
-
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows forks no processes")
 
 ENDING = """
 import atexit, sys, time
@@ -83,8 +59,9 @@ def test_signals_do_not_disturb_an_end(command: str, code: int, words: list[str]
 
 WORKING = """
 import os, sys, time
+from collections.abc import Callable
 from pathlib import Path
-from torchgrasp.app import cli
+from torchgrasp.files import hold_folder
 from torchgrasp.jobs import run_tasks
 
 def tell_and_sleep(path):
@@ -93,10 +70,12 @@ def tell_and_sleep(path):
     time.sleep(3600)
 
 def work(out: Path) -> int:
-    list(run_tasks(tell_and_sleep, [(str(out / name),) for name in "ab"], workers=2, limit=3600))
+    with hold_folder(out):
+        list(run_tasks(tell_and_sleep, [(str(out.parent / "mark"),)], workers=1, limit=3600))
     return 0
 
 if __name__ == "__main__":
+    from torchgrasp.app import cli
     cli.COMMANDS["work"] = work
     cli.run_and_exit()
 """
@@ -105,18 +84,67 @@ if __name__ == "__main__":
 @pytest.mark.promise("F6")
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize(("sign", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
-def test_workers_that_are_told_to_end_with_their_command_say_nothing(tmp_path: Path, sign: str, code: int, said: str):
-    """A terminal sends Ctrl-C to all processes of a command."""
+def test_a_command_that_is_told_to_end_says_so_alone_and_leaves_nothing(
+    tmp_path: Path, sign: str, code: int, said: str
+):
+    """A terminal sends Ctrl-C to all processes of a command; its worker says nothing, and its folder is let go."""
     pytest.importorskip("pebble")
-    (tmp_path / "script.py").write_text(WORKING)
-    command = [sys.executable, str(tmp_path / "script.py"), "work", "--out", str(tmp_path)]
+    script, mark = tmp_path / "script.py", tmp_path / "mark"
+    script.write_text(WORKING)
+    command = [sys.executable, str(script), "work", "--out", str(tmp_path / "out")]
     run = start_process(command, start_new_session=True)
-    marks = [tmp_path / "a", tmp_path / "b"]
-    while run.poll() is None and not all(mark.exists() for mark in marks):
+    while run.poll() is None and not mark.exists():
         time.sleep(0.05)
-    workers = [int(mark.read_text()) for mark in marks]
     os.killpg(run.pid, getattr(signal, sign))
     _, told = run.communicate()
     assert (run.returncode, told) == (code, f"torchgrasp: {said}\n")
-    while any(Path(f"/proc/{worker}").exists() for worker in workers):  # one that stayed ends the test by its time
+    assert sorted(tmp_path.iterdir()) == [mark, script]
+    while Path(f"/proc/{mark.read_text()}").exists():  # a worker that stayed ends the test by its time
         time.sleep(0.05)
+
+
+STREAMS = "stdin", "stdout", "stderr"
+
+
+def exit_code_without(closed: set[int], act: Callable[[], int]) -> int | None:
+    """Return what an action returns in a child whose standard streams are open but for some."""
+
+    def work() -> None:
+        for stream, name in enumerate(STREAMS):
+            file = os.open(os.devnull, os.O_RDWR)
+            os.dup2(file, stream)
+            os.close(file)
+            setattr(sys, name, open(stream, "r" if stream == 0 else "w", closefd=False))
+        for stream in closed:
+            os.close(stream)
+            setattr(sys, STREAMS[stream], None)  # as Python itself does when it starts
+        os._exit(act())
+
+    child = multiprocessing.get_context("fork").Process(target=work)
+    child.start()
+    child.join()
+    return child.exitcode
+
+
+@pytest.mark.promise("F3")
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no /dev/full")
+def test_a_full_disk_behind_stdout_is_named():
+    script = "import sys; from torchgrasp.app.cli import main; sys.exit(main(['objects']))"
+    with open("/dev/full", "w") as full:
+        run = subprocess.run([sys.executable, "-c", script], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (run.returncode, run.stderr) == (2, "torchgrasp: [Errno 28] No space left on device\n")
+
+
+def test_without_stdout_a_command_does_its_work():
+    assert exit_code_without({1}, lambda: cli.main(["objects"])) == 0
+
+
+@pytest.mark.parametrize("closed", [{2}, {1, 2}, {0, 1, 2}])
+def test_without_streams_a_command_ends_as_with_them_and_no_file_takes_their_place(closed):
+    """A command is refused; then a file is opened, which may be no standard stream: libraries print into those."""
+
+    def act() -> int:
+        code = cli.main(["cloud", "check", "none.ply"])
+        return 10 * code + (os.open(os.devnull, os.O_RDONLY) > 2)
+
+    assert exit_code_without(closed, act) == 21

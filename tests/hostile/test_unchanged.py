@@ -4,7 +4,6 @@ They run in a process of their own: the annotation checks of the tests draw from
 """
 
 import random
-import subprocess
 import sys
 import warnings
 from importlib import import_module
@@ -18,23 +17,21 @@ import torch
 from tests.hostile.arguments import checked_things, required, wrong_arguments
 from tests.hostile.samples import hints_of
 from tests.hostile.unchanged import changes
+from tests.make import run_python
 from torchgrasp.base import Value
 from torchgrasp.checks import Count
 
-SHARES = 4
-"""Processes that share the calls."""
 IMPORTED = "sympy", "sapien"
 """Packages of others that are imported late, and leave a filter of warnings and variables of the environment."""
-ROOT = Path(__file__).parents[2]
-SWEEP = "from pathlib import Path; from tests.hostile.test_unchanged import sweep; sweep({}, Path({!r}))"
+SWEEP = "from pathlib import Path; from tests.hostile.test_unchanged import sweep; sweep(Path({!r}))"
 
 
-def sweep(share: int, folder: Path) -> None:
-    """Print every call of a share that changes something, and what."""
+def sweep(folder: Path) -> None:
+    """Print every call that changes something, and what."""
     warnings.simplefilter("ignore")
     for package in filter(find_spec, IMPORTED):
         import_module(package)
-    for name, (make, annotated) in sorted(checked_things().items())[share::SHARES]:
+    for name, (make, annotated) in sorted(checked_things().items()):
         call, hints = make(), hints_of(annotated)
         good = required(annotated, call, folder)
         one = {key: 1 for key, hint in hints.items() if hint == Count}  # one start, one row: little work
@@ -88,13 +85,6 @@ def test_a_call_that_changes_nothing_is_told_so():
 
 
 @pytest.mark.promise("N10")
-@pytest.mark.parametrize("share", range(SHARES))
-def test_no_call_changes_its_arguments_or_the_state_of_the_process(share, tmp_path):
-    found = subprocess.run(
-        [sys.executable, "-c", SWEEP.format(share, str(tmp_path))],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
+def test_no_call_changes_its_arguments_or_the_state_of_the_process(tmp_path):
+    found = run_python("-c", SWEEP.format(str(tmp_path)))
     assert (found.returncode, found.stdout) == (0, ""), found.stdout + found.stderr

@@ -1,4 +1,4 @@
-"""scripts/bench.py: each bench runs on its smallest case, and the measures agree with closed forms."""
+"""scripts/bench.py and scripts/train.py: each bench runs on its smallest case; measures agree with closed forms."""
 
 import json
 import math
@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 from benchmarks.close.conditions import CONDITIONS, draw_solid
+from benchmarks.close.holding import EDGES, least_grip
 from benchmarks.close.misplaced import _misplace, median_over
 from benchmarks.common import Options, measure
 from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
@@ -16,6 +17,8 @@ from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_m
 from benchmarks.shape.accuracy import find_edges, mean_row, measure_shape
 from benchmarks.shape.walls import measure_walls
 from scipy.spatial.transform import Rotation
+from train.bands import fit_factor
+from train.bodies import COUNTS, author_body
 
 from tests.make import cup, cup_view
 from tests.pinch import cylinder, pinch
@@ -116,3 +119,58 @@ def test_draw_solid_is_closed_and_near_the_mean_surface():
 
 def test_median_over_resamples_families():
     assert median_over([("tin", 1.0), ("tin", 3.0), ("cup", 2.0), ("jug", math.nan)]) == (2.0, 2.0, 2.0)
+
+
+PINCH = torch.tensor([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, -0.03, 0.0]]).double()
+UP = torch.tensor([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]).double()
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.8])
+def test_least_grip_of_opposing_fingers_is_the_weight_over_the_friction(friction):
+    normals = PINCH / 0.03
+    forces = least_grip(PINCH, normals, UP, friction)
+    assert forces is not None and torch.allclose(forces.sum(0), UP[:3], atol=1e-8)
+    total = float(-(forces * normals).sum())
+    assert 2.0 / friction <= total * 1.0000001 <= 2.0 / friction / math.cos(math.pi / EDGES) * 1.0000001
+
+
+def test_least_grip_is_none_for_fingers_on_one_side_and_for_weak_drives():
+    normals = torch.tensor([1.0, 0.0, 0.0]).double().expand(4, 3)
+    assert least_grip(PINCH, normals, UP, 0.8) is None
+    outward = PINCH / 0.03
+    for effort, held in ((0.7, True), (0.6, False)):  # each finger has to push with 0.625 N
+        torques = outward[:, None] / effort * torch.eye(4).double()[:, :, None]
+        assert (least_grip(PINCH, outward, UP, 0.8, torques) is not None) is held
+
+
+@pytest.mark.parametrize("spread", [0.4, 1.1])
+def test_fit_factor_is_the_spread_of_normal_errors(spread: float):
+    generator = np.random.default_rng(0)
+    views = [spread * np.abs(generator.standard_normal(4000)) for _ in range(12)]
+    assert fit_factor(views) == pytest.approx(spread, abs=0.03)
+
+
+def test_success_model_recovers_its_weights_and_judges_held_out_families():
+    pytest.importorskip("sklearn")
+    from benchmarks.close.success import Trials, describe, fit, leave_one_out
+
+    rng = np.random.default_rng(0)
+    known, hand = rng.normal(size=(4000, 4)), np.where(rng.random(4000) < 0.5, "one", "other")
+    test = np.where(rng.random(4000) < 0.5, "pose-noise, uncertainty", "dexgraspbench, open_loop")
+    true = np.array([1.5, -1.0, 0.0, 0.5])
+    odds = known @ true + np.where(hand == "one", 0.9, -0.1) - 1.0 * (test == "pose-noise, uncertainty")
+    passed = rng.random(4000) < 1 / (1 + np.exp(-odds))
+    kind = np.array([f"kind {k}" for k in rng.integers(0, 8, 4000)])
+    trials = Trials(known, passed, kind, kind, hand, test)
+    model = fit(trials)
+    np.testing.assert_allclose([*model.weights, model.pose_error], [*true, -1.0], atol=0.2)
+    predicted, mine = leave_one_out(trials), kind == "kind 3"
+    assert describe(predicted, trials)["error"] < 0.05
+    lied = trials._replace(passed=np.where(mine, ~passed, passed))  # the own outcomes of a family do not matter
+    np.testing.assert_array_equal(leave_one_out(lied)[mine], predicted[mine])
+
+
+def test_authored_bodies_are_closed_and_repeatable():
+    bodies = {kind: author_body(kind, 0) for kind in COUNTS}
+    assert all(body.is_volume for body in bodies.values())
+    np.testing.assert_array_equal(author_body("bowl", 0).vertices, bodies["bowl"].vertices)

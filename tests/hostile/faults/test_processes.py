@@ -23,21 +23,19 @@ from torchgrasp.data.shipped import DATA
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 REAL = """
-import sys, time
+import time
 time.perf_counter = time.process_time = lambda: 0.0  # pages tell how long the work took
 import torchgrasp.posture_model.dataset, torchgrasp.posture_model.sample
 torchgrasp.posture_model.dataset.CHUNK_POSTURES = torchgrasp.posture_model.sample.CHUNK_POSTURES = 300
-from torchgrasp.app import cli
 
 if __name__ == "__main__":
+    from torchgrasp.app import cli
     cli.run_and_exit()
 """
 """The command line, whose clocks stand still and whose chunks are small; workers import it, too."""
 
 STUB = """
-import dataclasses, os, signal, sys, time
-from pathlib import Path
-from torchgrasp.app import cli
+import dataclasses, os, signal, time
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import run as campaign
 from torchgrasp.evaluation.score import ProtocolResult
@@ -59,13 +57,14 @@ def attempt(view, protocol, spec, row, draw):
 campaign._plan, campaign._try, campaign.TRIAL_LIMIT = plan, attempt, float(os.environ.get("LIMIT", "3600"))
 
 if __name__ == "__main__":
+    from torchgrasp.app import cli
     cli.evaluate.import_simulator = lambda name: None
     cli.run_and_exit()
 """
 """`evaluate` without planning and simulation; the second grasp of the view "left" meets with something."""
 
 
-def objects(folder: Path, *views: str) -> list[str]:
+def objects(folder: Path, *views: str, workers: str = "2") -> list[str]:
     """Make a folder of one object; return the words that evaluate it."""
     (folder / "cup").mkdir(parents=True)
     shutil.copy(DATA / "cylinder" / "mesh.ply", folder / "cup" / "mesh.ply")
@@ -73,7 +72,7 @@ def objects(folder: Path, *views: str) -> list[str]:
         shutil.copy(DATA / "cylinder" / "view.ply", folder / "cup" / f"{view}_noisy.ply")
     entry = {"views": {view: {"T_object_camera": POSE} for view in views}}
     (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": entry}}))
-    return ["evaluate", "--objects", str(folder), "--hand", "barrett", "--workers", "2", "--out"]
+    return ["evaluate", "--objects", str(folder), "--hand", "barrett", "--workers", workers, "--out"]
 
 
 def words(name: str, folder: Path) -> list[str]:
@@ -146,7 +145,7 @@ def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
     killed = attempts = 0
     while killed < (20 if long else 1):
         out = tmp_path / f"out{attempts}"
-        for _ in range(5):  # it is continued, and killed again
+        for _ in range(5 if long else 2):  # it is continued, and killed again
             run = start(REAL, tmp_path, command(out))
             time.sleep(draw.uniform(0.2, 1.0) * lasts)
             below = descendants(run.pid)
@@ -166,7 +165,7 @@ def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
 @pytest.mark.parametrize("how", ["hangs", "dies", "is killed"])
 def test_a_worker_that_is_lost_costs_its_own_row_and_the_row_says_so(how: str, tmp_path: Path):
     pytest.importorskip("pebble")
-    given = objects(tmp_path / "objects", "left", "right")
+    given = objects(tmp_path / "objects", "left", "right", workers="1")
     run = start(STUB, tmp_path, [*given, str(tmp_path / "out")], HOW=how, **{"LIMIT": "3"} if how == "hangs" else {})
     if how == "is killed":
         worker = None
