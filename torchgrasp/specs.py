@@ -206,7 +206,7 @@ class TrialSpec(Value):
     def __post_init__(self) -> None:
         """Check fields that depend on each other."""
         choose_options(self.closing, self.options)
-        check_sensor(self.sensor, self.closing, self.holding)
+        check_modes(self.sensor, self.closing, self.holding)
         if self.max_force is not None and self.force > self.max_force:
             raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
         if not self.control_rate * self.timestep < 1 + 1e-9:
@@ -219,8 +219,10 @@ class TrialSpec(Value):
         return choose_options(self.closing, self.options)
 
 
-def check_sensor(sensor: SensorModel, closing: str, holding: str) -> None:
-    """Raise `BadArgument` if a closing or holding mode needs more than the sensor measures."""
+def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
+    """Raise `BadArgument` for modes that do not go together, or that need more than the sensor measures."""
+    if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
+        raise BadArgument("holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)")
     poor = f"one of kind {sensor.kind!r}" + (f" with {', '.join(sensor.dead)} dead" if sensor.dead else "")
     allowed = "kind 'tactile' with no finger dead for {}"
     if not sensor.full and closing in ("position", "paper_position", "paper"):

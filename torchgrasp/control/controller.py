@@ -12,13 +12,15 @@ from torchgrasp.base import check_device, settle
 from torchgrasp.checks import Range, checked
 from torchgrasp.closure import ClosingOptions, choose_options
 from torchgrasp.control.holding import ForceHold, GripHold, PositionHold
-from torchgrasp.control.paper.closings import OpenLoopClosing, PaperClosing, PositionClosing
+from torchgrasp.control.paper.closings import Impedance, OpenLoopClosing, PaperClosing, PositionClosing
+from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.control.recovery import PRESSING_TIME, GraspCheck, GuardedApproach, Reopening, can_guard
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.specs import ClosingMode, HoldingMode, check_sensor
+from torchgrasp.hand.hand import Hand
+from torchgrasp.specs import ClosingMode, HoldingMode, check_modes
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Maps an observation and the time to the next tick [s] to the targets of all joints [rad]."""
@@ -74,15 +76,14 @@ class GraspController:
         approach: Annotated[float, Range(0.0, 1.0)] = 0.0,
     ) -> None:
         self.options = choose_options(closing, options)
-        check_holding(closing, holding)
-        check_sensor(reference.sensor, closing, holding)
+        check_modes(reference.sensor, closing, holding)
         if approach and not (self.options.stops and can_guard(reference)):
             allowed = "0 without stops, or without a table, a surface and a direction in the reference"
             raise BadArgument("approach", approach, allowed)
         self.reference = reference = settle(reference, torch.device("cpu"))
         self.guard = GuardedApproach(reference, self.options, approach) if approach else None
         self._make_closing = functools.partial(make_closing, reference, closing, self.options)
-        self._choose_holding = functools.partial(choose_holding, mode=holding)
+        self._make_hold = choose_holding(reference.hand, holding)
         self.attempts, self.stops = 0, 0
         self._begin(self._make_closing())
         self.targets = Targets(reference.expand(reference.pregrasp), left=approach)
@@ -90,7 +91,6 @@ class GraspController:
     def _begin(self, closing: Closing) -> None:
         """Start one attempt to close, with the given closing controller."""
         self.closing, self.hold, self.check, self.reopening = closing, None, None, None
-        self._make_hold = self._choose_holding(closing)
         self.time, self.pressed = 0.0, 0.0
         self.attempts += 1
 
@@ -160,7 +160,11 @@ class GraspController:
         if not over or isinstance(self.closing, OpenLoopClosing):
             self.time += period
             return self.closing(observation, period)
-        self.hold = self._make_hold(self.reference, observation, self.targets.joints)
+        if self._make_hold is None:
+            assert isinstance(self.closing, PaperClosing | UncertaintyClosing)
+            self.hold = self.closing.press()
+        else:
+            self.hold = self._make_hold(self.reference, observation, self.targets.joints)
         if self.options.attempts > 1 and self.reference.table is not None:
             assert isinstance(self.closing, UncertaintyClosing)
             last = self.attempts >= self.options.attempts
@@ -187,12 +191,6 @@ class GraspController:
         return targets
 
 
-def check_holding(closing: str, holding: str) -> None:
-    """Raise `BadArgument` for the holding "law" after a closing that does not use the control law."""
-    if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
-        raise BadArgument("holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)")
-
-
 def make_closing(reference: ClosingReference, mode: ClosingMode, options: ClosingOptions) -> Closing:
     """Return the closing controller of a closing mode."""
     match mode:
@@ -211,15 +209,10 @@ def make_closing(reference: ClosingReference, mode: ClosingMode, options: Closin
 
 
 def choose_holding(
-    closing: Closing, mode: HoldingMode
-) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step]:
-    """Return the constructor of the hold controller of a mode; "impedance" also loads the hand's stability model."""
+    hand: Hand, mode: HoldingMode
+) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
+    """Return the constructor of the hold controller of a mode; None: the closing controller itself presses."""
     if mode == "impedance":
-        closing.reference.hand.require_three("holding", "'impedance', whose virtual frame is of three,")
-        from torchgrasp.control.paper.closings import Impedance
-        from torchgrasp.control.paper.stability import load_stability
-
-        return functools.partial(Impedance, stability=load_stability(closing.reference.hand))
-    if mode == "law" and isinstance(closing, PaperClosing | UncertaintyClosing):
-        return lambda *_: closing.press()
-    return {"force": ForceHold, "grip": GripHold}.get(mode, PositionHold)
+        hand.require_three("holding", "'impedance', whose virtual frame is of three,")
+        return functools.partial(Impedance, stability=load_stability(hand))
+    return {"force": ForceHold, "grip": GripHold, "position": PositionHold}.get(mode)

@@ -66,31 +66,22 @@ def squeeze(
     >>> squeeze(load_hand("barrett"), load_shipped_grasp("jug", "barrett")).forces.norm(dim=-1).round(decimals=1)
     tensor([[2., 2., 4.]], dtype=torch.float64)
     """
-    check_squeeze(hand, grasps, force, kp)
+    check_hand(hand, grasps)
     hand, joints = settle(hand.to(torch.float64), grasps.joints.device), grasps.joints.double()
     points, normals = contacts_in_hand(grasps)
     forces = desired_forces(points, normals, force)
     return press(joints, hand.jacobian(joints, points), forces, joint_stiffness(hand, kp))
 
 
-def check_squeeze(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> None:
-    """Raise `BadArgument` for grasps of another hand, or a force [N] or stiffness [N m/rad] out of range."""
-    check_fingers(hand, grasps)
-    if grasps.joints.shape[-1] != hand.dof:
-        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} joints of {hand.name}")
-    if not 0.0 < force < 1e3:
-        raise BadArgument("force", force, "a number in (0, 1000) [N]")
-    if kp is not None and not 0.0 < kp < 1e6:
-        raise BadArgument("kp", kp, "a number in (0, 10^6) [N m/rad]")
-
-
-def check_fingers(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` for grasps of other fingers than the hand's; grasps without finger names pass."""
+def check_hand(hand: Hand, grasps: Grasps) -> None:
+    """Raise `BadArgument` for grasps of other fingers or joints than the hand's; grasps without finger names pass."""
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
     if tuple(names) != hand.finger_names or grasps.contacts.fingertips != len(names):
         found = f"{grasps.contacts.fingertips} contacts a row, of the fingers {', '.join(names)}"
         allowed = f"those of the hand: {', '.join(hand.finger_names)}; `hand_of(grasps)` loads the fingers of grasps"
         raise BadArgument("grasps", found, allowed)
+    if grasps.joints.shape[-1] != hand.dof:
+        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} joints of {hand.name}")
 
 
 def press(
@@ -110,15 +101,10 @@ def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
     return torch.tensor(kps, dtype=torch.float64)
 
 
-def actuated_stiffness(coupling: Float[Tensor, "j h"], kp: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint, including the joints that are coupled to it."""
-    return (coupling**2 * kp[:, None]).sum(0)
-
-
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint of a hand whose drives have `kp`; None: the hand's own."""
+    """Return the stiffness [N m/rad] of each actuated joint and the joints that are coupled to it; `kp` as above."""
     coupling = hand.actuated.coupling
-    return actuated_stiffness(coupling, drive_stiffness(hand, kp).to(coupling))
+    return (coupling**2 * drive_stiffness(hand, kp).to(coupling)[:, None]).sum(0)
 
 
 def tip_compliance(

@@ -13,7 +13,7 @@ from torchgrasp.base import Value
 from torchgrasp.checks import ANY, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closure import ClosingGains, SensorModel
 from torchgrasp.control.forces import (
-    check_squeeze,
+    check_hand,
     contacts_in_hand,
     desired_forces,
     drive_stiffness,
@@ -112,7 +112,7 @@ class ClosingReference(Value):
                 positive, joints beyond their limits, or numbers in the grasp that are not finite.
         """
         check_single(grasp)
-        check_squeeze(hand, grasp, force, kp)
+        check_hand(hand, grasp)
         contacts = grasp.contacts
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
         check_tensor("grasp.contacts.normals", contacts.normals, (1, len(hand.tips), 3))

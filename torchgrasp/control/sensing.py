@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.base import map_tensors
 from torchgrasp.checks import Positive, checked
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import (
@@ -169,7 +170,7 @@ class FingertipSensor:
             self.switched = torch.where(self.switched, report.reading > TOUCH_ON, report.reading >= 0.45)
             report = feel_flags(report, self.switched)
         if not bool(self.alive.all()):
-            report = _silence(report, self.alive)
+            report = map_tensors(self._silence, report, no_contact(fingers=len(self.alive)))
         late = round(self.model.delay / max(period, 1 / SAMPLING_RATE))
         if self.sensed.reading is not before.reading:  # a sample is held until the next one
             self.reports = [*self.reports, report][-late - 1 :]
@@ -183,17 +184,6 @@ class FingertipSensor:
             torques = torques + self.model.noise * TORQUE_NOISE * drawn
         return torques
 
-
-def _silence(tactile: TactileState, alive: Bool[Tensor, "f"]) -> TactileState:
-    """Return a tactile state in which the dead fingertips feel nothing."""
-    quiet, row = no_contact(fingers=len(alive)), alive[:, None]
-    return dataclasses.replace(
-        tactile,
-        reading=tactile.reading * alive,
-        forces=tactile.forces * row,
-        contact=tactile.contact & alive,
-        points=torch.where(row, tactile.points, quiet.points),
-        normals=torch.where(row, tactile.normals, quiet.normals),
-        average=tactile.average * alive,
-        sliding=tactile.sliding * alive,
-    )
+    def _silence(self, felt: Tensor, nothing: Tensor) -> Tensor:
+        """Return a quantity that all fingertips felt, with `nothing` for the dead."""
+        return torch.where(self.alive if felt.ndim == 1 else self.alive[:, None], felt, nothing)

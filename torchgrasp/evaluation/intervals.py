@@ -34,11 +34,16 @@ class Share(NamedTuple):
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
     """Return passed and total trials for each unit, given pairs of unit name and outcome."""
-    counts: dict[str, tuple[int, int]] = {}
-    for name, passed in outcomes:
-        before = counts.get(name, (0, 0))
-        counts[name] = (before[0] + passed, before[1] + 1)
-    return counts
+    return {name: (int(passed), total) for name, (passed, total) in _sum_by(outcomes).items()}
+
+
+def _sum_by(values: Iterable[tuple[str, int | float]]) -> dict[str, tuple[int | float, int]]:
+    """Return sum and number of the values for each unit."""
+    sums: dict[str, tuple[int | float, int]] = {}
+    for name, value in values:
+        before = sums.get(name, (0, 0))
+        sums[name] = before[0] + value, before[1] + 1
+    return sums
 
 
 @checked
@@ -58,12 +63,7 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 @checked
 def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
     """Return the mean of values, with its interval over units, given pairs of unit name and value; NaN is left out."""
-    sums: dict[str, tuple[float, int]] = {}
-    for name, value in values:
-        if not math.isnan(value):
-            before = sums.get(name, (0.0, 0))
-            sums[name] = (before[0] + value, before[1] + 1)
-    return contrast_over([sums], [1.0], seed)
+    return contrast_over([_sum_by((name, x) for name, x in values if not math.isnan(x))], [1.0], seed)
 
 
 @checked

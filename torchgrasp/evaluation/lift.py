@@ -1,17 +1,22 @@
 """A simulated trial: approach, closing, lift and hold of the true object."""
 
+import dataclasses
 import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
+from torchgrasp.base import Value, map_tensors
 from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.cloud.agreement import check_agreement, check_stand
+from torchgrasp.control import TipContact
 from torchgrasp.control.reference import check_single
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, smooth_step
@@ -110,23 +115,24 @@ class _ObjectLost(Exception):
     """Raised when the object is too far away to continue the trial."""
 
 
-class _Tick(NamedTuple):
-    """The simulated state at one control tick.
+@dataclasses.dataclass(frozen=True)
+class _Tick(Value):
+    """The simulated state at one control tick, or with a leading axis the states at all ticks.
 
-    `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `contact` holds force, point,
-    normal, sliding speed and blend of each finger. `felt` holds the controller's estimates of friction and load.
+    `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `felt` holds the controller's
+    estimates of friction and load.
     """
 
-    time: float
-    forces: np.ndarray
-    object_pose: np.ndarray
-    hand_pose: np.ndarray
-    neighbour_pose: np.ndarray
-    joints: np.ndarray
-    touching: int
-    centre: np.ndarray
-    contact: np.ndarray
-    felt: tuple[float, float]
+    time: Float[Tensor, "*t"]
+    object_pose: Float[Tensor, "*t 4 4"]
+    hand_pose: Float[Tensor, "*t 4 4"]
+    neighbour_pose: Float[Tensor, "*t m 4 4"]
+    joints: Float[Tensor, "*t j"]
+    touching: Int[Tensor, "*t"]
+    centre: Float[Tensor, "*t 3"]
+    felt: Float[Tensor, "*t 2"]
+    blend: Float[Tensor, "*t f"]
+    truth: TipContact
 
 
 class _Lift:
@@ -194,16 +200,15 @@ class _Lift:
 
     def _record(self) -> None:
         """Record a tick; raise an error if the simulation has diverged or the object is too far away."""
-        robot, scene = self.run.robot, self.run.scene
-        now, touching, pose = robot.steps * self.spec.timestep, int(robot.finger.sum()), scene.object_pose()
-        centre = pose[:3, :3] @ scene.centre + pose[:3, 3]
-        tick = _Tick(
-            now, robot.force, pose, scene.hand_pose(), scene.neighbour_poses(), scene.joints(), touching, centre,
-            _contact_rows(self.run), self.run.felt,
+        robot, scene, pose = self.run.robot, self.run.scene, self.run.scene.object_pose()
+        arrays = (
+            np.float64(robot.steps * self.spec.timestep), pose, scene.hand_pose(), scene.neighbour_poses(),
+            scene.joints(), robot.finger.sum(), pose[:3, :3] @ scene.centre + pose[:3, 3], np.array(self.run.felt),
         )  # fmt: skip
+        tick = _Tick(*map(torch.as_tensor, arrays), blend=self.run.controller.blend, truth=robot.truth)
         self.ticks.append(tick)
         moved = self._moved()
-        if not np.isfinite(tick.joints).all() or not np.isfinite(moved):
+        if not bool(torch.isfinite(tick.joints).all()) or not math.isfinite(moved):
             raise FloatingPointError
         if moved > LOST_DISTANCE + self.spec.lift_height:
             self.pushed = self.pushed or moved
@@ -211,7 +216,7 @@ class _Lift:
 
     def _moved(self) -> float:
         """Return the distance [m] of the object's centre of mass from its start."""
-        return float(np.linalg.norm(self.ticks[-1].centre - self.ticks[0].centre))
+        return float(torch.linalg.vector_norm(self.ticks[-1].centre - self.ticks[0].centre))
 
     def _all_touched(self) -> bool:
         """Return whether all fingers have touched the object, or the closing has ended."""
@@ -220,10 +225,12 @@ class _Lift:
     def _verdict(self) -> Status:
         """Return the status of a completed trial: held, or the first failure."""
         judged_time = 0.2  # time [s] at the end of a trial in which contacts are counted
-        rise = np.array([tick.centre[2] - self.ticks[0].centre[2] for tick in self.ticks])
-        half = 0.5 * self.spec.lift_height
-        gripped = np.array([tick.touching >= 2 for tick in self.ticks[-self.run.robot.ticks(judged_time) :]])
-        if rise[-1] >= half and gripped.mean() > 0.5:
+        rise, half = (
+            [float(tick.centre[2] - self.ticks[0].centre[2]) for tick in self.ticks],
+            0.5 * self.spec.lift_height,
+        )
+        gripped = [bool(tick.touching >= 2) for tick in self.ticks[-self.run.robot.ticks(judged_time) :]]
+        if rise[-1] >= half and sum(gripped) > 0.5 * len(gripped):
             slip = self._motion(self.pressed, -1)
             return Status.OK if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE else Status.SLIPPED
         if not np.isfinite(self.run.robot.first_touch).all():
@@ -232,41 +239,38 @@ class _Lift:
             return Status.EJECTED
         if self.strained:
             return Status.TOO_WEAK
-        return Status.DROPPED if rise.max() >= half else Status.NOT_LIFTED
+        return Status.DROPPED if max(rise) >= half else Status.NOT_LIFTED
 
     def _motion(self, first: int | None, last: int | None, in_hand: bool = True) -> ObjectMotion:
         """Return the object's motion between two ticks, relative to the hand or the world; NaN if a tick is None."""
         if first is None or last is None:
             return ObjectMotion(math.nan, math.nan)
-        start, end = (torch.from_numpy(self.ticks[k].object_pose) for k in (first, last))
-        if in_hand:
-            start, end = (
-                inverse(torch.from_numpy(self.ticks[k].hand_pose)) @ pose for k, pose in ((first, start), (last, end))
-            )
+        ticks = self.ticks[first], self.ticks[last]
+        start, end = (inverse(x.hand_pose) @ x.object_pose if in_hand else x.object_pose for x in ticks)
         centres = apply(torch.stack([start, end]), torch.from_numpy(self.run.scene.centre).expand(2, 1, 3))[:, 0]
         distance = float(torch.linalg.vector_norm(centres[1] - centres[0]))
         return ObjectMotion(distance, float(rotation_angle(start[:3, :3].T @ end[:3, :3])))
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record of the trial as a `ClosureResult`."""
-        columns = [torch.from_numpy(np.stack(column)) for column in zip(*self.ticks, strict=True)]
-        time, forces, object_pose, hand_pose, neighbour_pose, joints, *_, contact, felt = columns
-        reached = [math.nan if k is None else float(time[k]) for k in (self.arrived, self.touched, self.pressed)]
+        ticks = map_tensors(lambda *tensors: torch.stack(tensors), *self.ticks)
         robot, obj_from_world = self.run.robot, self.run.obj_from_world
-        first_touch, first_stray = robot.first_touch, torch.from_numpy(robot.first_stray)
+        reached = [math.nan if k is None else ticks.time[k] for k in (self.arrived, self.touched, self.pressed)]
+        first_touch, first_stray, truth = robot.first_touch, torch.from_numpy(robot.first_stray), ticks.truth
         touched = [finger for finger, step in enumerate(first_touch) if np.isfinite(step)]
+        assert truth.sliding is not None
         if not torch.equal(obj_from_world, torch.eye(4, dtype=torch.float64)):
-            world_from_obj = inverse(obj_from_world)
-            object_pose, neighbour_pose = (obj_from_world @ x @ world_from_obj for x in (object_pose, neighbour_pose))
-            hand_pose = obj_from_world @ hand_pose
+            bodies = {"object_pose": ticks.object_pose, "neighbour_pose": ticks.neighbour_pose}
+            moved = {name: obj_from_world @ x @ inverse(obj_from_world) for name, x in bodies.items()}
+            ticks = dataclasses.replace(ticks, hand_pose=obj_from_world @ ticks.hand_pose, **moved)
         return ClosureResult(
             held=status is Status.OK,
             status=status,
-            time=time,
-            forces=forces,
-            object_pose=object_pose,
-            hand_pose=hand_pose,
-            joints=joints,
+            time=ticks.time,
+            forces=truth.normal_force,
+            object_pose=ticks.object_pose,
+            hand_pose=ticks.hand_pose,
+            joints=ticks.joints,
             joint_names=self.run.scene.joint_names,
             contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
             object_motion=self._motion(self.arrived, -1),
@@ -280,21 +284,11 @@ class _Lift:
                 impulse=torch.from_numpy(robot.stray),
                 force=torch.from_numpy(robot.most_stray),
                 early=first_stray < min(first_touch),
-                neighbour_pose=neighbour_pose,
+                neighbour_pose=ticks.neighbour_pose,
             ),
-            trace=ClosingTrace(
-                *contact[..., :9].unflatten(-1, (3, 3)).unbind(-2), *contact[..., 9:].unbind(-1), *felt.T
-            ),
+            trace=ClosingTrace(truth.forces, truth.points, truth.normals, truth.sliding, ticks.blend, *ticks.felt.T),
             phases=torch.tensor(reached, dtype=torch.float64),
             stops=self.run.controller.stops,
             attempts=self.run.controller.attempts,
             seconds=seconds,
         )
-
-
-def _contact_rows(run: TrialRun) -> np.ndarray:
-    """Return force, point, normal, sliding and blend of each finger (f, 11)."""
-    truth = run.robot.truth
-    sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
-    blend = run.controller.blend
-    return torch.cat([truth.forces, truth.points, truth.normals, sliding[:, None], blend[:, None]], -1).numpy()

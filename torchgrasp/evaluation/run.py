@@ -68,12 +68,12 @@ def evaluate(
             refused.append(ViewScore(ascii(name), "", 0, math.nan, refusal=Status.BAD_OBJECT, note=note))
         else:
             names = entry.list_views(spec.complete, spec.views)
-            views += [_View(Path(objects), name, view, hand.source) for view in names]
+            views += [View(Path(objects), name, view, hand.source) for view in names]
     return _evaluate(views, refused, protocol, spec, folder, workers)
 
 
 def _evaluate(
-    views: "list[_View]",
+    views: list[View],
     refused: list[ViewScore],
     protocol: Protocol,
     spec: EvaluationSpec,
@@ -83,15 +83,14 @@ def _evaluate(
     """Yield the scores of all views; `evaluate` has checked the arguments."""
     yield from refused
     with _shelf(folder, spec.planned) as shelf:
-        views = [dataclasses.replace(view, shelf=shelf) for view in views]
-        plans = run_tasks(_plan, [(view, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
+        plans = run_tasks(_plan, [(view, shelf, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
         scores = [
             dataclasses.replace(view.score, seconds=math.nan, refusal=plan) if isinstance(plan, Status) else plan
             for view, plan in zip(views, plans, strict=True)
         ]
         rows = [choose_rows(score.executable, spec.grasps, spec.ranks) for score in scores]
         places = [list(itertools.product(chosen, range(protocol.noise.draws))) for chosen in rows]
-        tasks = [(view, protocol, spec, *at) for view, some in zip(views, places, strict=True) for at in some]
+        tasks = [(view, shelf, protocol, spec, *at) for view, some in zip(views, places, strict=True) for at in some]
         with contextlib.closing(run_tasks(_try, tasks, workers, TRIAL_LIMIT)) as results:
             for score, some in zip(scores, places, strict=True):
                 tried = [(at, next(results)) for at in some]
@@ -112,26 +111,15 @@ def _shelf(folder: Path | None, planned: bool) -> Iterator[Path]:
             yield Path(folder)
 
 
-@dataclasses.dataclass(frozen=True)
-class _View(View):
-    """A view of an object, and the folder for its grasps."""
-
-    shelf: Path = Path()
-
-    @property
-    def file(self) -> Path:
-        return self.shelf / self.object / f"{self.view}.safetensors"
-
-
-def _plan(view: _View, friction: float, spec: EvaluationSpec) -> ViewScore:
+def _plan(view: View, shelf: Path, friction: float, spec: EvaluationSpec) -> ViewScore:
     """Plan grasps on a view and save them, or count the grasps of an earlier call."""
-    found = plan_view(view, friction, spec, view.file if spec.planned else None)
+    found = plan_view(view, friction, spec, view.file(shelf) if spec.planned else None)
     if found.grasps is not None and not spec.planned:
         meta = found.grasps.meta | {REFUSAL: found.score.refusal.name}
-        dataclasses.replace(found.grasps, meta=meta).save(view.file)
+        dataclasses.replace(found.grasps, meta=meta).save(view.file(shelf))
     return found.score
 
 
-def _try(view: _View, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
+def _try(view: View, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
     """Try one of the saved grasps of a view."""
-    return try_grasp(view, load_grasps(view.file)[row], protocol, spec, (row, draw))
+    return try_grasp(view, load_grasps(view.file(shelf))[row], protocol, spec, (row, draw))

@@ -12,20 +12,15 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Measured, checked
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.errors import Status
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
-from torchgrasp.values import Grasps
 
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),
     "closing": (Status.NO_CONTACT, Status.EJECTED),
     "pulling or lifting": (
-        Status.MOVED,
-        Status.DROPPED,
-        Status.NOT_LIFTED,
-        Status.SLIPPED,
-        Status.TOO_WEAK,
-        Status.TOO_HEAVY,
+        *(Status.MOVED, Status.DROPPED, Status.NOT_LIFTED),
+        *(Status.SLIPPED, Status.TOO_WEAK, Status.TOO_HEAVY),
     ),
     "simulation": (Status.UNSTABLE, Status.TIMED_OUT, Status.WORKER_DIED),
 }
@@ -230,20 +225,3 @@ def _area_under_curve(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"]) 
         return math.nan
     below, upto = torch.searchsorted(bad, good), torch.searchsorted(bad, good, right=True)
     return float((below + upto).double().mean()) / 2 / len(bad)
-
-
-@checked
-def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
-    """Return whether the finger with the most certain contact touched first, as Sec. 5 expects of Eq. (27).
-
-    Args:
-        contact_order: fingers in the order of their first touch (`ClosureResult`).
-        grasp: a single grasp; of equally certain fingers any may be first.
-
-    Raises:
-        BadArgument: not exactly one grasp, or contacts without `std_m`.
-    """
-    if len(grasp) != 1:
-        raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
-    std_m = grasp.contacts.require_std()[0]
-    return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Pose, Seed, checked
-from torchgrasp.control.controller import GraspController, check_holding
+from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding import GripHold
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
@@ -64,7 +64,6 @@ class TrialDriver:
     """
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:
-        check_holding(spec.closing, spec.holding)
         check_single(trial.grasp)
         self.trial, self.spec = trial, spec
         hand, planned = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)

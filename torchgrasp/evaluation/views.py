@@ -102,6 +102,10 @@ class View:
         entry = read_entry(self.objects, self.object)
         return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
 
+    def file(self, folder: Path) -> Path:
+        """Return the path of the view's grasps in a folder."""
+        return folder / self.object / f"{self.view}.safetensors"
+
     def load_hand(self) -> Hand:
         """Load the hand of the view, with its fingers."""
         return load_hand(self.hand.urdf_path.parent, self.hand.option)
@@ -122,15 +126,14 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
         MissingExtra, OutputError: errors that do not depend on the object.
     """
     most_friction = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
-    hand, score = view.load_hand(), view.score
-    started = time.process_time()
+    hand, score, started = view.load_hand(), view.score, time.process_time()
     try:
         mesh, _ = _read_solid(view.objects, view.object)  # a bad mesh is refused before planning; its parts are cached
         cloud = read_view(view.objects, view.object, view.view)
         check_mesh(cloud, mesh)
         check_stand(mesh, Plane.horizontal(0.0))
         if planned is not None:
-            return PlannedView(*_read_planned(planned, score, cloud, hand))
+            return _read_planned(planned, score, cloud, hand)
         started = time.process_time()
         contacts = ContactSpec(friction=min(friction, most_friction), table=Plane.horizontal(0.0))
         stages: dict[str, Any] = {}
@@ -153,14 +156,15 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
     return PlannedView(score, cloud, grasps)
 
 
-def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -> tuple[ViewScore, PointCloud, Grasps]:
+def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -> PlannedView:
     """Read the grasps of a view that an earlier call planned with the same cloud and hand."""
     grasps = load_grasps(path)
     if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.source.sha256):
         raise BadArgument("folder", f"{path} of another cloud or hand", "grasps of this view")
     reason = Status.__members__.get(grasps.meta.get(REFUSAL, ""), Status.OUT_OF_REACH)
     refusal, fingers = Status.OK if len(grasps) else reason, grasps.meta.get("finger_names", "")
-    return dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers), cloud, grasps
+    score = dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers)
+    return PlannedView(score, cloud, grasps)
 
 
 def try_grasp(

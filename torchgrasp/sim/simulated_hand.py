@@ -78,7 +78,8 @@ class SimulatedHand:
         self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
         self.sensor = FingertipSensor(reference, generator)
         nothing = torch.full((fingers, 3), torch.nan, dtype=torch.float64)
-        self.truth = TipContact(torch.zeros(fingers).double(), torch.zeros_like(nothing), nothing, nothing)
+        zero = torch.zeros(fingers, dtype=torch.float64)
+        self.truth = TipContact(zero, torch.zeros_like(nothing), nothing, nothing, sliding=zero)
         self._poses: np.ndarray | None = None
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
         self._centres = torch.cat([centres, torch.ones(fingers, 1, dtype=torch.float64)], dim=-1).numpy()

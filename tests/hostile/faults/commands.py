@@ -85,12 +85,12 @@ def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     views = {name: {"T_object_camera": POSE} for name in ("left", "right")}
     (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": {"views": views}}}))
 
-    def plan(view: Any, friction: float, spec: EvaluationSpec) -> ViewScore:
-        grasps.save(view.file)
+    def plan(view: Any, shelf: Path, friction: float, spec: EvaluationSpec) -> ViewScore:
+        grasps.save(view.file(shelf))
         return dataclasses.replace(view.score, executable=len(grasps))
 
-    def try_grasp(view: Any, protocol: Any, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
-        score = float(load_grasps(view.file)[row].score[0])
+    def try_grasp(view: Any, shelf: Path, protocol: Any, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
+        score = float(load_grasps(view.file(shelf))[row].score[0])
         return ProtocolResult(row, draw, True, Status.OK, 0.0, 0.0, score, 0.0, 0.0)
 
     monkeypatch.setattr(evaluate_command, "import_simulator", lambda name: None)

@@ -40,10 +40,10 @@ from torchgrasp.errors import Status
 from torchgrasp.evaluation import run as campaign
 from torchgrasp.evaluation.score import ProtocolResult
 
-def plan(view, friction, spec):
+def plan(view, shelf, friction, spec):
     return dataclasses.replace(view.score, executable=2)
 
-def attempt(view, protocol, spec, row, draw):
+def attempt(view, shelf, protocol, spec, row, draw):
     if (view.view, row) == ("left", 1):
         mark = view.objects / f"{os.getpid()}.new"
         mark.write_text(str(os.getpid()))

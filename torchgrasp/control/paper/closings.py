@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.checks import checked
-from torchgrasp.control.forces import actuated_stiffness
 from torchgrasp.control.holding import RAMP, held_forces, regulate
 from torchgrasp.control.law import POSITION_RATE, blend, damped_inverse, joint_step, tip_velocity
 from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
@@ -201,7 +200,7 @@ class Impedance:
     ) -> None:
         self.reference, self.stability, self.coupling = reference, stability, reference.hand.actuated.coupling
         self.springs = torch.full((3,), GRASP_STIFFNESS).to(observation.tips) if springs is None else springs
-        self.stiffness = actuated_stiffness(self.coupling, reference.kp)
+        self.stiffness = (self.coupling**2 * reference.kp[:, None]).sum(0)
         forces, self.strength = held_forces(reference, observation)
         self.frame = rigid(torch.eye(3).to(observation.tips), observation.tips.mean(0))
         self.rest, self.lengths = self._frame(observation.tips), side_lengths(observation.tips)
