@@ -39,16 +39,8 @@ def versions() -> dict[str, str]:
 def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str]) -> bytes:
     """Plan and try the grasps of one job; return the bytes of a shard file that holds only this job.
 
-    Args:
-        view: the object, its view and the hand.
-        protocol: protocol of the trials.
-        spec: options of planning and trials.
-        meta: metadata of the shard; `versions` are the package versions with which the campaign began.
-
-    Raises:
-        BadArgument: other versions or another hand than the campaign's, as on a machine of a cluster.
-        MissingExtra, OutputError, OSError: errors that are not the object's fault; bad files of the object give a row
-            with the reason.
+    A machine of a cluster needs the `versions` in `meta`, with which the campaign began, and the same hand. A faulty
+    object gives a row with the reason; errors that are not the object's fault are raised.
     """
     hand, here = view.load_hand(), json.dumps(versions())
     if here != meta["versions"]:

@@ -26,10 +26,7 @@ Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Maps an observation and the time to the next tick [s] to the targets of all joints [rad]."""
 
 Closing = OpenLoopClosing | PositionClosing | PaperClosing | UncertaintyClosing
-"""The controllers that move the fingers to the object."""
-
 Period = Annotated[float, Range(1e-5, 1.0)]
-"""Time [s] from one tick to the next."""
 
 CLOSING_TIME = 4.0  # longest time [s] of closing before the hand presses with the contacts that it has
 
@@ -52,8 +49,8 @@ class GraspController:
 
     Raises:
         BadArgument: unknown names; options or the holding "law" for a closing that has none; "impedance" for more than
-            three fingertips; a closing or holding that needs more than the sensor measures.
-        BadArgument: an approach without stops, or without a table, a surface and tactile fingertips (`can_guard`).
+            three fingertips; modes that need more than the sensor measures; an approach without stops, or without a
+            table, a surface and tactile fingertips (`can_guard`).
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.control import ClosingReference, no_contact, observe

@@ -24,14 +24,9 @@ LIFTED = 0.35  # load [N] from which the object counts as lifted
 
 
 class ForceHold:
-    """Press with balanced forces at the sensed contacts; the joints stay compliant.
+    """Press with balanced forces at the sensed contacts; `start` holds the joint targets [rad] at the closing's end.
 
-    One common factor of all forces is regulated: a force loop for each finger would drift and push the object.
-
-    Args:
-        reference: the closing plan.
-        observation: observation at the end of the closing.
-        start: joint targets at the end of the closing [rad].
+    The joints stay compliant. One factor scales all forces: a force loop for each finger would push the object.
     """
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
@@ -53,7 +48,7 @@ class ForceHold:
 
 
 class PositionHold:
-    """Keep the joint targets that the hand had at the end of the closing; arguments as for `ForceHold`."""
+    """Keep the joint targets that the hand had at the end of the closing."""
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
         self.start = start
@@ -93,9 +88,9 @@ class FrictionEstimate:
         self.mean, self.std = 0.8, PRIOR_STD
 
     def update(self, ratio: float, force: float, lagging: bool = False) -> None:
-        """Update the estimate by a sliding fingertip's ratio of tangential to normal force, and its normal force [N].
+        """Update the estimate by the friction ratio and the normal force [N] of a fingertip that slides.
 
-        `lagging`: the fingertip has just begun to slide, so the ratio is less certain.
+        The ratio is less certain while it is `lagging`: the fingertip has just begun to slide.
         """
         noise = (1 + lagging) * 0.4 * math.hypot(1.0, ratio) / force
         weight = self.std**2 / (self.std**2 + noise**2)
@@ -114,12 +109,9 @@ class FrictionEstimate:
 
 
 class GripHold:
-    """Press with the least forces that carry the load which the fingertips feel.
+    """Press with the least forces that carry the load which the fingertips feel, none above `reference.max_force`.
 
-    `status` turns `TOO_HEAVY` when a fingertip slides at the limits of torque or force. `weight` [N] is the felt load.
-
-    Args:
-        reference, observation, start: as for `ForceHold`; no finger presses harder than `reference.max_force`.
+    `status` turns `TOO_HEAVY` when a fingertip slides at the limits of torque or force.
     """
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
@@ -231,10 +223,7 @@ class GripHold:
         return 3.0 * (self.weight + 0.5) / self.friction.low
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
-        """Choose the friction coefficient for the next solution, and find out whether the load is too heavy.
-
-        The load is too heavy only if a finger slides at the limits of torque or force.
-        """
+        """Choose the friction coefficient for the next solution; judge whether the load is too heavy."""
         share, push = self.solver.share(self.normals, jacobian), -float((wanted * self.normals).sum())
         goal = min(self.friction.low + self.optimism, self.friction.high)
         if share > 1.0 or push > max(self._enough(), float(self.grip.sum())):
@@ -247,10 +236,7 @@ class GripHold:
             self.status = Status.TOO_HEAVY
 
     def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
-        """Return the forces that the drives exert: the wanted forces, with force feedback, less the carried load.
-
-        The drives carry four fifths of the load. Carrying all of it would press ever harder on a rigid table.
-        """
+        """Return the forces that the drives exert: the wanted forces, with force feedback, less the carried load."""
         if self.time > RAMP:
             lacking = ((self.felt - wanted) * self.normals).sum(-1)
             self.trim = self.trim - period * 4.0 * lacking[:, None] * self.normals
@@ -258,7 +244,8 @@ class GripHold:
             self.trim = (flat - contacts.inverse @ (contacts.wrench @ flat)).reshape(-1, 3)
             largest, bound = (float(np.linalg.norm(x, axis=-1).max()) for x in (self.trim, 0.5 * wanted))
             self.trim = self.trim * min(1.0, bound / max(largest, 1e-9))
-        return wanted + self.trim - (contacts.inverse @ (self.load - 0.8 * self.carried)).reshape(-1, 3)
+        missing = self.load - 0.8 * self.carried  # carrying all of it would press ever harder on a rigid table
+        return wanted + self.trim - (contacts.inverse @ missing).reshape(-1, 3)
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:

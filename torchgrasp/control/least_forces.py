@@ -47,12 +47,10 @@ def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -
 
 
 class LeastForces:
-    """A solver for the least fingertip forces; each call starts from the forces of the last call.
+    """A solver for the least fingertip forces [N]; each call starts from the forces of the last call.
 
-    Args:
-        start: initial guess of the forces on the object [N]; they press at every contact.
-        effort: largest torque of every joint [N m].
-        most: largest normal force of a finger [N].
+    The first call starts from the forces `start`, which press at every contact. `effort` [N m] limits the torque of
+    every joint, `most` [N] the normal force of a finger.
     """
 
     def __init__(self, start: Float[Array, "f 3"], effort: Float[Array, " j"], most: float) -> None:
@@ -72,7 +70,8 @@ class LeastForces:
         If no forces within the cones are found, the friction is raised to the least at which forces were found.
         """
         count = len(normals)
-        limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], self._normal(normals)])
+        push = -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
+        limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], push])
         gap = 0.01 * (float(np.linalg.norm(load[:3])) + float(floor.sum()))  # distance from the cones beyond the noise
         barrier = _Barrier(contacts, normals, limits, load, gap)
         growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # added internal forces, if the load has grown
@@ -95,11 +94,6 @@ class LeastForces:
         """Return the largest ratio of a joint torque or normal force to its limit."""
         torque = np.abs(np.einsum("nij,ni->j", jacobian, self.forces)) / self.effort
         return max(float(torque.max()), float((-(self.forces * normals).sum(-1)).max()) / self.most)
-
-    def _normal(self, normals: Float[Array, "f 3"]) -> Float[Array, "f n"]:
-        """Return the matrix from stacked forces (3f) to normal forces divided by their limit."""
-        count = len(normals)
-        return -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
 
 
 class _Barrier:

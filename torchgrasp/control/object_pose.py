@@ -25,11 +25,7 @@ class ContactPlanes:
 
     A fingertip that touches measures the offset of its plane, with the variance of the shape (Sigma_cov). A fingertip
     that is beyond its plane without a touch bounds the offset. The estimate maximises the posterior density under a
-    Gaussian prior, in the frame of the hand at its planned pose.
-
-    Args:
-        reference: the closing plan, with the contacts.
-        expected: mean [m, rad] of the prior; None: zero.
+    Gaussian prior with the mean `expected` [m, rad] (None: zero), in the frame of the hand at its planned pose.
     """
 
     def __init__(self, reference: ClosingReference, expected: Float[Tensor, "6"] | None = None) -> None:
@@ -44,9 +40,7 @@ class ContactPlanes:
     def displacement(self, points: Float[Tensor, "f 3"], touching: Bool[Tensor, "f"]) -> Float[Tensor, "6"]:
         """Return the most probable displacement: translation of the contacts' centroid [m], rotation about it [rad].
 
-        Args:
-            points: the point [m] of each fingertip that is ahead in its contact's direction.
-            touching: which fingertips touch.
+        `points` [m] are those of the fingertips that are ahead in the directions of their contacts.
         """
         off = ((points - self.target) * self.normals).sum(-1)
         beyond = (off - self.rows @ self.expected).clamp_min(-0.025)  # a finger farther on has missed the object

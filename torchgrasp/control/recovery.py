@@ -36,18 +36,13 @@ def can_guard(reference: ClosingReference) -> bool:
 
 
 class GuardedApproach:
-    """Move the opened hand to its pre-grasp, and stop when a fingertip touches (a guarded move).
+    """Move the opened hand to its pre-grasp, `length` [m] away, and stop when a fingertip touches (a guarded move).
 
     After a stop the hand averages the touch, locates the object, retreats, moves its palm sideways and goes on. After
     the last allowed stop it ignores touches.
 
     `left` [m] is the remaining approach, `palm` [m] the palm's displacement from its planned path, `stops` the number
     of stops, `displacement` [m, rad] the object's displacement at the last touch.
-
-    Args:
-        reference: a closing plan for which `can_guard` is true.
-        options: how often the hand stops, and how far its palm moves.
-        length: length [m] of the approach.
     """
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions, length: float) -> None:
@@ -101,13 +96,8 @@ class GuardedApproach:
 class GraspCheck:
     """Judge a pressing grasp: `judged` turns true when the result is known, `secure` says whether to lift.
 
-    `displacement` [m, rad] of the object is located anew from the touches if the surface was estimated.
-
-    Args:
-        reference: the closing plan.
-        displacement: displacement of the object [m, rad] that the closing estimated.
-        palm: displacement of the palm from its plan [m].
-        last: whether this is the last attempt; its grasp always counts as secure.
+    The `displacement` [m, rad] of the object, as the closing estimated it, is located anew from the touches if the
+    surface was estimated. `palm` [m] is displaced from its plan. The grasp of the `last` attempt counts as secure.
     """
 
     def __init__(
@@ -148,12 +138,8 @@ class GraspCheck:
 class Reopening:
     """Open the hand and move its palm to the displaced object; `done` says when the hand may close again.
 
-    Args:
-        reference: the closing plan.
-        displacement: displacement of the object [m, rad].
-        joints: present targets of all joints [rad].
-        palm: present displacement of the palm [m].
-        reach: largest displacement of the palm [m]; 0: the palm does not move.
+    The object has a `displacement` [m, rad], the hand the joint targets `joints` [rad]. The `palm` [m] moves to at most
+    `reach` [m]; 0: not at all.
     """
 
     def __init__(

@@ -67,10 +67,8 @@ class ClosingReference(Value):
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
-    >>> torch.equal(reference.pick(reference.expand(reference.joints)), reference.joints)
-    True
-    >>> reference.clamp(reference.joints).shape, reference.contact_points(reference.gains.target).shape
-    (torch.Size([4]), torch.Size([3, 3]))
+    >>> reference.joints.shape, reference.expand(reference.joints).shape
+    (torch.Size([4]), torch.Size([8]))
     """
 
     hand: Hand
@@ -170,11 +168,7 @@ class ClosingReference(Value):
 
     @property
     def alive(self) -> Bool[Tensor, "f"]:
-        """Whether each fingertip has a working sensor.
-
-        Raises:
-            BadArgument: the sensor names a dead finger that the hand does not have.
-        """
+        """Whether each fingertip has a working sensor; `BadArgument` for a dead finger that the hand does not have."""
         names, dead = self.hand.finger_names, self.sensor.dead
         if not set(dead) <= set(names):
             raise BadArgument("sensor", f"dead fingers {dead}", f"dead fingers among {names}")
@@ -205,10 +199,7 @@ def next_target(
     lead: Float[Tensor, " h"] | float,
     period: float,
 ) -> Float[Tensor, " h"]:
-    """Return the joint target [rad] one tick later, for fingertip velocities [m/s] (Eq. 25).
-
-    The target leads the measured joints by at most `lead` [rad], and stays within the joint limits.
-    """
+    """Return the joint target [rad] one tick later (Eq. 25); it leads the measured joints by at most `lead` [rad]."""
     jacobian = observation.jacobian @ reference.hand.actuated.coupling
     step = joint_step(jacobian, velocity, period, reference.joints - target)
     joints = reference.pick(observation.joints)

@@ -77,7 +77,10 @@ def feel_torques(
         found = f"fingertips, 3 and joints {tuple(jacobian.shape)}"
         raise BadArgument("jacobian", found, f"those of the hand, {shape}")
     forces_by, radius = _forces_by_torques(reference, jacobian), reference.hand.tips.radius
-    sensed = measure(tactile, _pushes(reference, forces_by @ torques), reference.normals, radius, period)
+    forces = forces_by @ torques
+    push, nowhere = -(forces * reference.normals).sum(-1), torch.full_like(forces, torch.nan)
+    pushes = TipContact(push.clamp_min(0.0), forces, nowhere, nowhere)
+    sensed = measure(tactile, pushes, reference.normals, radius, period)
     if sensed.reading is tactile.reading:
         return sensed
     factor = torch.einsum("fc,fcj->fj", reference.normals, forces_by).norm(dim=-1) * TORQUE_NOISE / NOISE
@@ -86,20 +89,11 @@ def feel_torques(
 
 
 def _forces_by_torques(reference: ClosingReference, jacobian: Float[Tensor, "f 3 j"]) -> Float[Tensor, "f 3 j"]:
-    """Return the linear map from joint torques [N m] to the most probable contact forces [N] under a Gaussian prior.
-
-    The prior suppresses directions that the torques barely observe.
-    """
+    """Return the map from joint torques [N m] to the most probable contact forces [N]; the prior is Gaussian."""
     along = reference.normals[:, :, None] * reference.normals[:, None]
     across, up = ((TORQUE_NOISE / std) ** 2 for std in (0.5, 3.0))  # [N] across and along the normal
     prior = across * torch.eye(3, dtype=jacobian.dtype) + (up - across) * along
     return torch.linalg.solve(jacobian @ jacobian.mT + prior, jacobian)
-
-
-def _pushes(reference: ClosingReference, forces: Float[Tensor, "f 3"]) -> TipContact:
-    """Return contacts with given forces [N]; their places are unknown (NaN)."""
-    push, nothing = -(forces * reference.normals).sum(-1), torch.full_like(forces, torch.nan)
-    return TipContact(push.clamp_min(0.0), forces, nothing, nothing)
 
 
 class DriveFeel:
@@ -136,9 +130,9 @@ class FingertipSensor:
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
-    >>> push, here, normals = torch.tensor([2.0, 0.0, 0.0]).double(), reference.gains.target, reference.normals
-    >>> sensor, jacobian = FingertipSensor(reference), torch.zeros(3, 3, 8).double()
-    >>> sensor(TipContact(push, -push[:, None] * normals, here, normals), jacobian, 0.01).contact
+    >>> push, here = torch.tensor([2.0, 0.0, 0.0]).double(), reference.normals
+    >>> truth = TipContact(push, -push[:, None] * here, here, here)
+    >>> FingertipSensor(reference)(truth, torch.ones(3, 3, 8).double(), period=0.01).contact
     tensor([ True, False, False])
     """
 

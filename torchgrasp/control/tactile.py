@@ -30,10 +30,6 @@ class TipContact(Value):
 
     `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN without contact.
     `sliding` [m/s] is the speed of the tip along the surface; None: no tip slides.
-
-    >>> normals, pressed = torch.eye(3), torch.tensor([2.0, 0.0, 1.0])  # [N]
-    >>> TipContact(pressed, -pressed[:, None] * normals, 0.03 * normals, normals).forces[0]
-    tensor([-2., -0., -0.])
     """
 
     normal_force: Float[Tensor, "*b f"]
@@ -57,9 +53,6 @@ class TactileState(Value):
         average: low-passed normal force [N] that sets the contact flag.
         sliding: sliding speed [m/s].
         age: time [s] since the last sample.
-
-    >>> no_contact().points[0]
-    tensor([nan, nan, nan], dtype=torch.float64)
     """
 
     reading: Float[Tensor, "*b f"]
@@ -160,9 +153,6 @@ class Targets(NamedTuple):
         joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
         palm: displacement of the palm [m] from its planned path, in the hand's axes; the palm does not rotate.
         left: remaining length [m] of the approach; 0: the hand is at its pre-grasp.
-
-    >>> Targets(torch.zeros(16)).palm
-    tensor([0., 0., 0.], dtype=torch.float64)
     """
 
     joints: Float[Tensor, " j"]
@@ -180,12 +170,6 @@ class Observation(Value):
         tips: centres of the fingertips [m].
         jacobian: Jacobian of these centres by all joints [m/rad].
         tactile: readings of the fingertips.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.control import no_contact
-    >>> hand = load_hand("barrett")
-    >>> observe(hand, (hand.lower + hand.upper) / 2, no_contact()).jacobian.shape
-    torch.Size([3, 3, 8])
     """
 
     joints: Float[Tensor, " j"]
@@ -202,11 +186,9 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
         BadArgument: joints or fingertips on another device than the hand.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.control import no_contact
     >>> hand = load_hand("barrett")
-    >>> joints = (hand.lower + hand.upper) / 2
-    >>> torch.allclose(observe(hand, joints, no_contact()).tips, hand.tip_centres(joints))
-    True
+    >>> observe(hand, (hand.lower + hand.upper) / 2, no_contact()).jacobian.shape
+    torch.Size([3, 3, 8])
     """
     check_device("tactile", tactile.lagged.device, "the hand", hand.lower.device)
     joints = joints.double()

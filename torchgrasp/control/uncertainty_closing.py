@@ -36,10 +36,6 @@ class UncertaintyClosing:
     * A finger without a working sensor rests at its estimated contact until the others touch. Then it searches until
       its drives feel a contact, or until it is three standard deviations beyond the contact.
     * The components of `ClosingOptions` that act while the fingers close: `wait`, `pose_estimate` and `palm_reach`.
-
-    Args:
-        reference: the closing plan, with contacts, gains and sensors.
-        options: which extensions are on.
     """
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:

@@ -92,11 +92,7 @@ def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
 
 
 def load_shard(path: Path, meta: dict[str, str]) -> Shard:
-    """Read a shard file; raise an error unless its metadata contains `meta`.
-
-    Raises:
-        ModelFileError: the file is missing, damaged, or of another campaign.
-    """
+    """Read a shard file; raise `ModelFileError` if it is missing or damaged, or its metadata lacks `meta`."""
     records, found = read_value(path, KIND, Records)
     if (other := {key: found.get(key) for key in meta}) != meta:
         raise ModelFileError("path", f"{path} of {other}", f"a shard of {meta}")
@@ -119,11 +115,7 @@ def load_shard(path: Path, meta: dict[str, str]) -> Shard:
 
 
 def read_row(field: Field, bare: bool = False) -> JobRow:
-    """Read the row of a job from JSON; a `bare` row has no metadata.
-
-    Raises:
-        ModelFileError: a missing field, or a field of a wrong type or range.
-    """
+    """Read the row of a job from JSON; a `bare` row has no metadata."""
     fields = field.entries(*JobRow._fields[: -1 if bare else None])  # the metadata comes last
     texts = {name: fields[name].text() for name in ("object", "view", "note", "family", "group")}
     counts = {name: fields[name].whole(0, MOST) for name in ("executable", "points", "grasps", "passed")}

@@ -51,11 +51,7 @@ class GoldenResult(NamedTuple):
 
 @checked
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
-    """Simulate each case of `GOLDEN`, and yield the results.
-
-    Raises:
-        MissingExtra: the simulator is not installed.
-    """
+    """Simulate each case of `GOLDEN`, and yield the results."""
     for case in GOLDEN:
         thing, hand = load_object(case.object), load_hand(case.hand)
         grasp = load_shipped_grasp(case.object, case.hand)

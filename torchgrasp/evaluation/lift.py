@@ -146,7 +146,7 @@ class _Lift:
         self.pressed: int | None = None
 
     def perform(self) -> Status:
-        """Run all phases of the trial - approach, closing, pressing, lift and hold; return its status."""
+        """Run all phases of the trial; return its status."""
         run = self.run
         self._record()
         if not run.starts:

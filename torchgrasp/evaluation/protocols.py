@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """Uniform pose errors along and about each axis, at most [m, rad]; `draws` is the number of draws for each grasp.
-
-    >>> PoseNoise(translation=0.005, rotation=math.radians(5)).draws
-    1
-    """
+    """Uniform pose errors along and about each axis, at most [m, rad]; `draws` is their number for each grasp."""
 
     translation: Length = 0.0
     rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
@@ -38,11 +34,7 @@ class PoseNoise(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """A pull, as force over mass [m/s^2] for some seconds, and the largest allowed motion of the object [m, rad].
-
-    >>> find_protocol("dexgraspbench").pull.acceleration
-    10.0
-    """
+    """A pull, as force over mass [m/s^2] for some seconds, and the largest allowed motion of the object [m, rad]."""
 
     acceleration: Annotated[float, Range(0.0, 1000.0)]
     seconds: Annotated[float, Range(0.0, 60.0)]
@@ -130,11 +122,7 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
 
 @checked
 def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]:
-    """Return the true pose of a hand, given its planned pose and the pose error, on the CPU in float64.
-
-    Raises:
-        BadArgument: an error that is no finite (4, 4).
-    """
+    """Return the true pose of a hand, given its planned pose and the pose error, on the CPU in float64."""
     planned = obj_from_hand.to("cpu", torch.float64)
     return planned if error is None else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
 

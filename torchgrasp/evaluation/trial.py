@@ -14,6 +14,7 @@ from torch import Tensor
 from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding import GripHold
+from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.errors import BadArgument
@@ -71,17 +72,17 @@ class TrialDriver:
         if trial.table is not None:
             self.obj_from_world = world_frame(trial.table, planned.obj_from_hand[0])
             grasp = _to_world(planned, self.obj_from_world)
-        derived = derive_reference(hand, grasp, spec) if reference is None else reference
+        body = self._body(trial.mesh, trial.parts)
+        if reference is None:
+            height = float(body.mesh.bounds[0, 2]) if trial.table is None else 0.0
+            table = Plane.horizontal(height).moved(inverse(grasp.obj_from_hand[0])) if spec.table else None
+            known = {"table": table, "surface": trial.surface, "sensor": spec.sensor, "max_force": spec.max_force}
+            derived = derive_reference(hand, grasp, spec)
+            reference = dataclasses.replace(derived, obj_from_hand=planned.obj_from_hand[0], **known)
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
             raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
-        body = self._body(trial.mesh, trial.parts)
-        height = float(body.mesh.bounds[0, 2]) if trial.table is None else 0.0
-        if reference is None:
-            table = Plane.horizontal(height).moved(inverse(grasp.obj_from_hand[0])) if spec.table else None
-            known = {"table": table, "surface": trial.surface, "sensor": spec.sensor, "max_force": spec.max_force}
-            derived = dataclasses.replace(derived, obj_from_hand=planned.obj_from_hand[0], **known)
-        self.reference = derived
+        self.reference = reference
         self.scene_spec = self._scene_spec(hand, grasp, body)
 
     def _scene_spec(self, hand: Hand, grasp: Grasps, body: Body) -> SceneSpec:
@@ -138,8 +139,6 @@ def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingRefer
     """Return the closing plan of a trial; for closing "paper" the stability model [6], if any, gives the forces."""
     stability = None
     if spec.closing == "paper":
-        from torchgrasp.control.paper.stability import load_stability
-
         hand.require_three("closing", "'paper', whose model of stability is of three,")
         stability = load_stability(hand)
     return ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp, stability)

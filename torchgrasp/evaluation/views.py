@@ -69,11 +69,7 @@ class EvaluationSpec(Value):
 
     @property
     def tried(self) -> str:
-        """Text that says which grasps are tried.
-
-        >>> EvaluationSpec(20).tried, EvaluationSpec(6, "spread").tried
-        ('the 20 best of each view', 'up to 6 of each view, spread over all ranks')
-        """
+        """Text that says which grasps are tried, such as "the 20 best of each view"."""
         if self.ranks == "spread":
             return f"up to {self.grasps} of each view, spread over all ranks"
         return f"the {self.grasps} best of each view" if self.grasps > 1 else "the best of each view"
@@ -120,11 +116,7 @@ class PlannedView(NamedTuple):
 
 
 def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path | None = None) -> PlannedView:
-    """Plan grasps on a view, or read the grasps of an earlier call from the file `planned`.
-
-    Raises:
-        MissingExtra, OutputError: errors that do not depend on the object.
-    """
+    """Plan grasps on a view, or read the grasps of an earlier call from the file `planned`."""
     most_friction = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
     hand, score, started = view.load_hand(), view.score, time.process_time()
     try:

@@ -36,12 +36,7 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """Imported grasps: joints [rad], poses of the hand's root link in the object's frame, pre-grasp if known.
-
-    >>> poses = torch.eye(4).double().repeat(5, 1, 1)
-    >>> ForeignGrasps(torch.zeros(5, 12).double(), poses, pregrasp=None).joints.shape
-    torch.Size([5, 12])
-    """
+    """Imported grasps: joints [rad], poses of the hand's root link in the object's frame, pre-grasp if known."""
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Float[Tensor, "g 4 4"]

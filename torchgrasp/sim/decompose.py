@@ -24,9 +24,7 @@ SECONDS, SECONDS_PER_FACE = 60.0, 0.005  # processor time [s] that a mesh may ta
 def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return vertices and faces of the convex parts into which CoACD cuts a mesh.
 
-    Raises:
-        MeshError: CoACD takes more time or memory than the size of the mesh allows, as for a mesh that crosses itself.
-        MissingExtra: CoACD is not installed.
+    Raises `MeshError` if CoACD takes more time or memory than the size of the mesh allows.
     """
     from torchgrasp.errors import MeshError, MissingExtra
 

@@ -137,14 +137,7 @@ def _import_mujoco() -> Any:
 
 
 def scene_mjcf(spec: SceneSpec) -> str:
-    """Return the MJCF model of a scene as XML; all joints are at zero.
-
-    Actuators are position servos, named like their joints.
-
-    Raises:
-        BadArgument: a joint of the hand without a position or drive.
-        HandFileError: the URDF is not valid (`read_urdf`).
-    """
+    """Return the MJCF model of a scene as XML, with all joints at zero and a position servo for each joint."""
     urdf = spec.urdf
     movable = [joint.name for joint in urdf.joints if joint.kind != "fixed"]
     spec.check_drives(movable)

@@ -67,25 +67,6 @@ class Scene(abc.ABC):
     Arrays are in the world's axes; joints are in the order of `joint_names`. `centre` [m] is the object's centre of
     mass in its own frame, `timestep` is in seconds. A simulator's subclass sets `joint_names` and the handles of
     bodies, and calls `_map_contacts`.
-
-    >>> from torchgrasp import load_hand, load_object
-    >>> jug, hand, pose = load_object("jug"), load_hand("barrett"), np.eye(4)
-    >>> pose[2, 3] = 1.0  # [m] above the jug
-    >>> start, tips = dict.fromkeys(hand.tree.joint_names, 0.1), hand.tips.links
-    >>> spec = SceneSpec(hand.urdf_path, pose, start, hand.actuators, tips, jug.mesh, jug.parts, 0.2, yields=0.02)
-    >>> from torchgrasp.sim import open_scene
-    >>> scene = open_scene(dataclasses.replace(spec, approach=(0.0, 0.0, -0.1)))
-    >>> scene.penetration(), scene.neighbour_poses().shape
-    (0.0, (0, 4, 4))
-    >>> scene.drive(scene.joints() + 0.1)
-    >>> scene.pull(np.array([0.0, 0.0, -1.0]))  # [N]
-    >>> scene.approach(0.05, speed=-0.1)
-    >>> scene.lift(0.01, speed=0.1)
-    >>> scene.shift(np.array([0.001, 0.0, 0.0]))
-    >>> scene.step().finger, scene.object_pose().shape, scene.hand_pose().shape
-    (array([False, False, False]), (4, 4), (4, 4))
-    >>> scene.jacobian(scene.tip_poses()[:, :3, 3]).shape  # [m/rad] by all joints
-    (3, 3, 8)
     """
 
     joint_names: tuple[str, ...]

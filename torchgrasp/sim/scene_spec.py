@@ -40,10 +40,6 @@ class Neighbour:
         mesh: closed mesh [m] in the frame of the grasp.
         parts: convex bodies that make up the mesh; None: `convex_parts` of the mesh.
         mass: mass [kg]; None: from `TrialSpec.mass` or `TrialSpec.density`, as for the object.
-
-    >>> import trimesh
-    >>> Neighbour(trimesh.creation.box([0.05, 0.05, 0.1]), mass=0.2).mass
-    0.2
     """
 
     mesh: "trimesh.Trimesh"
@@ -90,12 +86,6 @@ class SceneSpec:
         neighbours: other bodies on the table.
         self_pairs: pairs of the hand's links that collide with each other.
         yields: largest displacement [m] of the mount along each axis of the world; 0: the mount is stiff.
-
-    >>> from torchgrasp import load_hand, load_object
-    >>> jug, hand = load_object("jug"), load_hand("barrett")
-    >>> start, tips = dict.fromkeys(hand.tree.joint_names, 0.1), hand.tips.links
-    >>> spec = SceneSpec(hand.urdf_path, np.eye(4), start, hand.actuators, tips, jug.mesh, jug.parts, mass=0.2)
-    >>> spec.check_drives(list(hand.tree.joint_names))
     """
 
     urdf_path: Path | str
@@ -176,9 +166,6 @@ def mounted_urdf(spec: SceneSpec) -> str:
 
     `<visual>` elements are left out, because they need a render device. `<mimic>` elements are left out, because
     SAPIEN's mimic joints transmit wrong forces; coupled joints get their own targets instead.
-
-    Raises:
-        HandFileError: the file is not a valid URDF (`read_urdf`).
     """
     urdf = spec.urdf
     robot = ET.fromstring(urdf.xml)
@@ -224,14 +211,7 @@ def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[
     """Return for each link in `pairs` two bit masks: its collision group, and the groups that it collides with.
 
     Two links collide if the group of one shares a bit with the mask of the other, as in PhysX and MuJoCo. Only one link
-    of each pair needs its own bit.
-
-    Args:
-        pairs: pairs of link names that collide.
-        first: first free bit.
-
-    Raises:
-        HandFileError: the pairs need more bits than the masks have.
+    of each pair needs its own bit; `first` is the first free bit. Pairs that need more bits raise `HandFileError`.
     """
     bits = 31  # MuJoCo's masks are signed numbers of 32 bits
     left = [tuple(pair) for pair in pairs]

@@ -53,16 +53,6 @@ class SimulatedHand:
         reference: the closing plan.
         control_rate: rate of control ticks [Hz].
         generator: draws the noise of the fingertips; None: no noise.
-
-    >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
-    >>> from torchgrasp.specs import TrialSpec
-    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
-    >>> trial = GraspTrial(load_hand("barrett"), grasp, jug.mesh, parts=jug.parts)
-    >>> run = TrialDriver(trial, TrialSpec()).open()
-    >>> run.robot.tick(run.controller.targets).tactile.contact, run.robot.ticks(0.5), run.robot.unbalanced()
-    (tensor([False, False, False]), 50, nan)
     """
 
     def __init__(

@@ -182,12 +182,8 @@ class Impedance:
     """Hold the object like a spring between the fingertips: object-level impedance, by joint targets q + J^T f / kp.
 
     At rest the forces are the desired forces, balanced at the sensed contacts. Null-space motions of the joints are
-    suppressed. If the stability model judges the grasp unstable, forces and stiffness rise and stay high.
-
-    Args:
-        reference, observation, start: as for `ForceHold`.
-        springs: stiffness [N/m] along each side of the triangle of fingertips; None: `GRASP_STIFFNESS`.
-        stability: model of the hand's stable grasps; None: the grasp does not adapt.
+    suppressed. `springs` [N/m] act along the sides of the triangle of fingertips; None: of `GRASP_STIFFNESS`. If the
+    `stability` model judges the grasp unstable, forces and stiffness rise and stay high; None: they do not adapt.
     """
 
     def __init__(

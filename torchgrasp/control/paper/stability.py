@@ -68,9 +68,6 @@ class StabilityModel(Value):
         others: density of the states of all other grasps.
         share: fraction of training trials that were stable: the prior probability.
         meta: hand, bodies, trials, seed, and the scores on held-out bodies.
-
-    Raises:
-        BadArgument: mixtures over other variables, or a share outside (0, 1).
     """
 
     stable: GaussianMixture
@@ -85,14 +82,9 @@ class StabilityModel(Value):
 
     @checked
     def preferred_forces(self, tips: Float[Tensor, "3 3"], force: Positive | None = None) -> PreferredForces:
-        """Return forces and stiffness of stable grasps with the same distances between fingertips [6].
+        """Return forces and stiffness of stable grasps with the same distances between the `tips` [m] [6].
 
-        Args:
-            tips: centres of the fingertips [m], in any frame.
-            force: force [N] of the finger that presses hardest; None: the model's own.
-
-        Raises:
-            BadArgument: numbers that are not finite.
+        `force` [N] is that of the finger that presses hardest; None: the model's own.
         """
         lengths = lengths_of(tips.double())
         given = dict(zip(LENGTHS, lengths.log().tolist(), strict=True))
@@ -124,22 +116,14 @@ class StabilityModel(Value):
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the model as safetensors, atomically; `load_stability` reads it.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write the model as safetensors, atomically; `load_stability` reads it."""
         tensors = {f"{kind}.{part}": getattr(getattr(self, kind), part) for kind, part in PARTS}
         return save_tensors(path, "stability", tensors, {**self.meta, "share": repr(self.share)})
 
 
 @checked
 def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel | None:
-    """Read the stability model of a hand.
-
-    Args:
-        hand: the hand.
-        path: the file; None: `FILE` in the hand's folder, and no model if the file does not exist.
+    """Read the stability model of a hand from a file; None: `FILE` in the hand's folder, no model without the file.
 
     Raises:
         ModelFileError: the file is missing or malformed.
