@@ -8,15 +8,15 @@ python scripts/train.py success                                   the predicted 
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
 python scripts/train.py bands DIR                                 how far off hidden sides are
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
+python scripts/train.py scene                                     the depth image of the shipped scene
 python scripts/train.py golden                                    grasps with known verdicts, for torchgrasp selftest
 """
 
 import sys
 
 import tyro
-from train.author_objects import objects, scene
+from train.author_objects import golden, objects, scene
 from train.bands import bands
-from train.golden import golden
 from train.occupancy import occupancy
 from train.stability import stability
 from train.success import success
@@ -24,15 +24,7 @@ from train.success import success
 from torchgrasp.errors import GraspError
 
 if __name__ == "__main__":
-    commands = {
-        "stability": stability,
-        "success": success,
-        "occupancy": occupancy,
-        "bands": bands,
-        "objects": objects,
-        "scene": scene,
-        "golden": golden,
-    }
+    commands = {x.__name__: x for x in (stability, success, occupancy, bands, objects, scene, golden)}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")
     except GraspError as error:

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from torchgrasp.files import write_file
 from torchgrasp.geometry.linalg import unit
 
 ROOT = Path(__file__).resolve().parents[2]
+Result = TypeVar("Result")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,6 +175,12 @@ def least_seconds(action: Callable[[], object], repeats: int = 5, limit: float =
         if len(times) == 1 and times[0] > limit:
             return times[0]
     return min(times[1:])
+
+
+def timed(action: Callable[[], Result]) -> tuple[Result, float]:
+    """Return the result of an action, and the processor's time that it took [s]."""
+    began = time.process_time()
+    return action(), time.process_time() - began
 
 
 def peak_mib() -> float | None:

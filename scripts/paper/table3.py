@@ -1,7 +1,6 @@
 """Table 3 of the paper with the objects of torchgrasp: how many points the filter keeps, and how long shapes take."""
 
 import json
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from benchmarks.common import timed
 
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
 from torchgrasp.base import join
@@ -76,10 +76,3 @@ def condition_again(shape: ShapeGP) -> object:
     known = on_surface(on, normals, torch.full_like(on[:, 0], NOISE), NOISE)
     beside = off_surface(off, shape.predict(shape.metres(off)).distance, NOISE)
     return posterior_given(join([known, beside]), shape.kernel)
-
-
-def timed(action: Callable[[], Any]) -> tuple[Any, float]:
-    """Return the result of an action and the processor's seconds."""
-    began = time.process_time()
-    result = action()
-    return result, time.process_time() - began

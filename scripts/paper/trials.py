@@ -91,7 +91,6 @@ def cell_path(spec: TableSpec, row: Row, subject: Subject, hand: str) -> Path:
 
 def fill(spec: TableSpec, rows: tuple[Row, ...], subject: Subject, hand_name: str) -> tuple[Cell, ...]:
     """Return the cells of one object and hand; each is kept as soon as it is there."""
-    torch.set_num_threads(1)
     bench, cells = _Bench(spec, subject, hand_name), []
     for row in rows:
         path = cell_path(spec, row, subject, hand_name)

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import tyro
 from markupsafe import Markup, escape
 from PIL import Image
@@ -195,7 +194,6 @@ def options_of(part: Figure, sizes: Sizes) -> dict[str, Any]:
 
 def make_figure(name: str, out: Path, sizes: Sizes) -> str:
     """Make one figure and keep its output; return the reason of a failure, or nothing."""
-    torch.set_num_threads(1)
     part = next(part for part in PARTS if part.name == name)
     assert isinstance(part, Figure)
     began, said = time.process_time(), io.StringIO()

@@ -1,15 +1,21 @@
 """Write the files of torchgrasp's own objects into torchgrasp/data/assets, the same bytes every time.
 
-Run it after a change of `train/object_shapes.py` or of the virtual camera; it needs the extra `dev`.
+Run `objects` after a change of `train/object_shapes.py` or of the virtual camera; it needs the extra `dev`.
 """
+
+import dataclasses
 
 import numpy as np
 import trimesh
 
+from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data.shipped import DATA, SCENE, list_objects
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.evaluation.golden import GOLDEN, run_golden
 from torchgrasp.files import write_file
+from torchgrasp.specs import Simulator
 
 VIEWS = {"cylinder": (20.0, 30.0), "jug": (60.0, 35.0), "rabbit": (55.0, 30.0), "spray": (50.0, 25.0)}
 """Azimuth and elevation [deg] of the camera for each object."""
@@ -59,5 +65,24 @@ def write_object(name: str) -> None:
     }
     write_file(DATA / name / "parts.npz", lambda file: np.savez_compressed(file, **columns))
     azimuth, elevation = VIEWS[name]
-    save_cloud(partial_view(mesh, look_at(azimuth, elevation, target=mesh)), DATA / name / "view.ply")
+    cloud = partial_view(mesh, look_at(azimuth, elevation, target=mesh))
+    save_cloud(dataclasses.replace(cloud, frustum=None), DATA / name / "view.ply")  # the whole object is in view
     print(f"{name}: {len(mesh.faces)} faces, {mesh.volume * 1e6:.0f} cm3, {len(parts)} parts")
+
+
+def golden(seed: int = 0) -> None:
+    """Plan the grasps of the golden set, and refuse a set whose verdicts are not the expected ones.
+
+    Args:
+        seed: of the plans.
+    """
+    for name, hand_name in sorted({(case.object, case.hand) for case in GOLDEN}):
+        hand = load_hand(hand_name)
+        grasps = plan_grasps(load_object(name).view, hand, ContactSpec(table=0.0), starts=300, seed=seed)
+        grasps[grasps.status == Status.OK][0].save(DATA / name / f"{hand_name}.safetensors")
+    simulators: tuple[Simulator, ...] = ("sapien", "mujoco")
+    for simulator in simulators:
+        for result in run_golden(simulator):
+            print(simulator, result)
+            if not result.right:
+                raise BadArgument("seed", f"{seed}: {result.case} is wrong in {simulator}", "one with right verdicts")

@@ -1,5 +1,6 @@
 """scripts/bench.py and scripts/train.py: each bench runs on its smallest case; measures agree with closed forms."""
 
+import dataclasses
 import json
 import math
 from fractions import Fraction
@@ -12,6 +13,8 @@ from benchmarks.close.conditions import CONDITIONS, draw_solid
 from benchmarks.close.holding import EDGES, least_grip
 from benchmarks.close.misplaced import _misplace, median_over
 from benchmarks.common import Options, measure
+from benchmarks.gpu.compare import bench_kernel
+from benchmarks.gpu.kernels import kernels
 from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
 from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
 from benchmarks.shape.accuracy import find_edges, mean_row, measure_shape
@@ -27,7 +30,7 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import solve_closure_lp, wrenches
 
-RUNS = ("gpu/kernels", "hand/collision", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
+RUNS = ("hand/collision", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -39,11 +42,19 @@ def test_bench_writes_its_rows(name, tin, tmp_path):
         starts=30, scale=2e-4, workers=0, out=tmp_path / "out",
     )  # fmt: skip
     rows = measure(subject, options)
-    assert len(rows) > 0 or name == "gpu/kernels"
+    assert len(rows) > 0
     written = json.loads((tmp_path / "out" / f"bench_{subject}.json").read_text())
     assert [row["what"] for row in written["rows"]] == [row.what for row in rows]
     table = (tmp_path / "out" / f"{subject}-{short}.md").read_text()
     assert "Commit " in table and table.count("\n| ") == len(rows) + 2
+
+
+def test_kernels_of_the_gpu_bench_agree_with_themselves():
+    quick = [kernel for kernel in kernels(True) if kernel.name in ("condition", "certify", "Hand.jacobian", "EM step")]
+    assert len(quick) == 4
+    for kernel in quick:
+        small = dataclasses.replace(kernel, sizes=kernel.sizes[:1])
+        assert bench_kernel(small, torch.device("cpu"), (1,)).met, kernel.name
 
 
 def test_measure_refuses_an_unknown_bench():

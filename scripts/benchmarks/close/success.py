@@ -149,7 +149,6 @@ def grasps_at(source: Path, name: str, hand: str, folder: Path) -> Path:
 
 def try_object(source: Path, name: str, hand: str, grasps: int, folder: Path) -> None:
     """Plan on the first view of an object, and keep a row for each trial: grasp, test, and whether it passed."""
-    torch.set_num_threads(1)
     model, rows, view = load_hand(hand), [], next(view for found, view in list_views(source) if found == name)
     planned = plan_grasps(read_view(source, name, view), model, ContactSpec(friction=FRICTION, table=0.0), STARTS)
     executable = planned[planned.status == Status.OK]

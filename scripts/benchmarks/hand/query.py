@@ -5,13 +5,9 @@ directions of its pads are the contacts. A code is solved when every fingertip i
 no link in another; the share that touches inside the pads' cones as well is printed beside it.
 """
 
-import time
-from collections.abc import Callable
-from typing import TypeVar
-
 import torch
 
-from benchmarks.common import Options, Row, bench
+from benchmarks.common import Options, Row, bench, timed
 from torchgrasp import Contacts, load_hand, load_mixture
 from torchgrasp.errors import Status
 from torchgrasp.ik.candidates import TIP_TOLERANCE
@@ -25,8 +21,6 @@ LEAST_SOLVED = {"allegro": 0.99, "barrett": 0.97}
 """Least share of codes that are solved."""
 MOST_ERROR = 0.05
 """Most median of the worst tip's error [mm]."""
-
-Result = TypeVar("Result")
 
 
 @bench("hand/codes")
@@ -44,12 +38,6 @@ def codes(o: Options) -> list[Row]:
             bar = None if model is None else LEAST_SOLVED.get(name, 0.97)
             rows.append(_solved_row(f"{name}, {what}", solution, seconds / len(contacts), bar))
     return rows
-
-
-def timed(action: Callable[[], Result]) -> tuple[Result, float]:
-    """Return the result of an action, and the processor's time that it took [s]."""
-    began = time.process_time()
-    return action(), time.process_time() - began
 
 
 def _solved_row(what: str, solution: IKSolution, seconds: float, bar: float | None) -> Row:
