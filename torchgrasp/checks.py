@@ -234,7 +234,6 @@ def _read_container(name: str, value: Any, origin: type, inside: tuple[Any, ...]
 
 
 def _has_tensor(hint: Any) -> bool:
-    """Return whether an annotation contains a tensor."""
     inner = () if typing.get_origin(hint) is collections.abc.Callable else typing.get_args(hint)
     return hint is Tensor or is_tensor(hint) or any(map(_has_tensor, inner))
 

@@ -60,7 +60,6 @@ def run_as_they_end(
 def _in_order(
     results: Generator[tuple[int, Future[Result] | Status], None, None],
 ) -> Generator[Result | Status, None, None]:
-    """Yield results in the order of the tasks."""
     early: dict[int, Future[Result] | Status] = {}
     turn = 0
     with contextlib.closing(results):

@@ -141,10 +141,9 @@ def _wrong_pads(urdf: Urdf, spec: HandSpec) -> Iterator[HandFileError]:
 
 
 def _inside(point: np.ndarray, shape: Shape) -> bool:
-    """Return whether a point of a link lies inside a shape."""
     x, y, z = rotation_from_rpy(shape.rpy).numpy().T @ (point - shape.xyz)
     if shape.kind == "box":
-        return bool((2 * np.abs([x, y, z]) < shape.size).all())
+        return bool((np.abs([x, y, z]) < shape.half).all())
     if shape.kind == "cylinder":
         return bool(np.hypot(x, y) < shape.size[0] and 2 * abs(z) < shape.size[1])
     return bool(np.linalg.norm([x, y, z]) < shape.size[0])

@@ -114,13 +114,11 @@ def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: d
 
 
 def _hints(of: type[Value]) -> dict[str, Any]:
-    """Return the type annotations of a dataclass's fields."""
     hints = typing.get_type_hints(of)
     return {field.name: hints[field.name] for field in dataclasses.fields(of)}  # pyright: ignore[reportArgumentType]
 
 
 def _is_value(hint: Any) -> bool:
-    """Return whether an annotation is a subclass of `Value`."""
     return typing.get_origin(hint) is None and isinstance(hint, type) and issubclass(hint, Value)
 
 

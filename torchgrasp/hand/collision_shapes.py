@@ -73,9 +73,7 @@ def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float
     single_layer = 0.025  # a shape thinner than this [m] has one layer of cells across
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
-    cylinder = shape.kind == "cylinder"
-    # a cylinder is cut as its bounding box
-    size = (2 * shape.size[0], 2 * shape.size[0], shape.size[1]) if cylinder else shape.size
+    size = [2 * x for x in shape.half]  # a cylinder is cut as its bounding box
     counts = [1 if x == min(size) and x < single_layer else max(1, round(x / cell)) for x in size]
     half = [x / n / 2 for x, n in zip(size, counts, strict=True)]
     thinnest = min((x / 2 for x, n in zip(size, counts, strict=True) if n == 1), default=math.inf)
@@ -88,7 +86,7 @@ def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float
         # a sphere is pulled in until it stands out of a face by no more than the bulge
         reach = [max(0.0, s / 2 + bulge - radius) for s in size]
         center = [math.copysign(min(abs(c), r), c) for c, r in zip(center, reach, strict=True)]
-        if cylinder:
+        if shape.kind == "cylinder":
             rim, out = max(0.0, shape.size[0] + bulge - radius), math.hypot(center[0], center[1])
             if out > rim:
                 center[:2] = [center[0] * rim / out, center[1] * rim / out]
@@ -132,8 +130,7 @@ def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, flo
     if shape.kind == "sphere":
         return [(rotation, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]
     if shape.kind == "box":
-        x, y, z = shape.size
-        return [(rotation, shape.xyz, (x / 2, y / 2, z / 2), 0.0)]
+        return [(rotation, shape.xyz, shape.half, 0.0)]
     boxes = 6
     step = math.pi / boxes
     corner = 2 * shape.size[0] / (1 + math.cos(step / 2))  # as far outside the circle as the sides are inside

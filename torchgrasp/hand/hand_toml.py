@@ -145,7 +145,6 @@ def _triple(field: Field) -> Triple:
 
 
 def _finger(field: Field) -> Finger:
-    """Read a finger with its pad."""
     required = ("name", "joints", "tip_link", "contact", "normal", "tip")
     table = _entries(field, required, {"center": None, "radius": None})
     contact, normal, kind = _triple(table["contact"]), _triple(table["normal"]), table["tip"].value
@@ -163,7 +162,6 @@ def _finger(field: Field) -> Finger:
 
 
 def _option(field: Field, known: tuple[Finger, ...]) -> Option:
-    """Read the grasping fingers and the parked joints of an option."""
     table, by_name = _entries(field, ("fingers",), {"parked": {}}), {f.name: f for f in known}
     names = _texts(table["fingers"])
     if not _is_graspable(names, by_name):
@@ -198,7 +196,6 @@ def _choose(
 
 
 def _coupling(field: Field) -> dict[str, Mimic]:
-    """Read the coupled joints from hand.toml."""
     coupling, joints = dict[str, Mimic](), field.entries()
     for joint, row in joints.items():
         table = _entries(row, ("source", "ratio", "offset"), {})

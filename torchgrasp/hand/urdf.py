@@ -46,6 +46,13 @@ class Shape:
     rpy: Triple
     file: str = ""
 
+    @property
+    def half(self) -> Triple:
+        """Half sizes [m] of the box around a box, sphere or cylinder."""
+        if self.kind == "box":
+            return self.size[0] / 2, self.size[1] / 2, self.size[2] / 2
+        return self.size[0], self.size[0], self.size[0] if self.kind == "sphere" else self.size[1] / 2
+
 
 @dataclasses.dataclass(frozen=True)
 class Link:

@@ -156,7 +156,6 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _coupling(urdf: Urdf) -> dict[str, Mimic]:
-    """Return the coupling of each coupled joint by name."""
     return {j.name: j.mimic for j in urdf.movable if j.mimic is not None}
 
 

@@ -134,14 +134,6 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
     raise BadArgument("tips", tip, "links that a joint moves")
 
 
-def _half(shape: Shape) -> Vector:
-    """Return the half sizes of the bounding box of a shape."""
-    if shape.kind == "box":
-        return np.array(shape.size) / 2
-    radius = shape.size[0]
-    return np.array([radius, radius, radius if shape.kind == "sphere" else shape.size[1] / 2])
-
-
 def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
     """Return a point near the far end of a tip, in its frame; in a simple shape half a thickness before the end."""
     if not is_primitive(link):
@@ -149,7 +141,7 @@ def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
         reach = np.linalg.norm(points @ pose[:, :3].T + pose[:, 3], axis=1)
         return points[reach > reach.max() - BESIDE].mean(0)
     shape = link.shapes[0]
-    center, half = np.array(shape.xyz), _half(shape)
+    center, half = np.array(shape.xyz), np.array(shape.half)
     rotation, long = rotation_from_rpy(shape.rpy).numpy(), int(half.argmax())
     inset = half[long] - np.delete(half, long).min()
     return center + math.copysign(inset, rotation[:, long] @ center) * rotation[:, long]
@@ -161,7 +153,7 @@ def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
         normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]
         center, normal = np.array(shape.xyz), normal / np.linalg.norm(normal)
         return Pad(_triple(center + radius * normal), _triple(normal), _triple(center), radius)
-    rotation, half = rotation_from_rpy(shape.rpy).numpy(), _half(shape)
+    rotation, half = rotation_from_rpy(shape.rpy).numpy(), np.array(shape.half)
     side = rotation.T @ motion
     side[int(half.argmax())] = 0.0  # the pad is beside the tip, not at its end
     if shape.kind == "box":

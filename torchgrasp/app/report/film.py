@@ -19,7 +19,7 @@ from torchgrasp.app.report.canvas import (
 )
 from torchgrasp.app.report.run import explain_loss, first_touches, moments_of, moved_in_hand, tick_of
 from torchgrasp.app.report.solids import solids_from_hand
-from torchgrasp.app.report.stills import to_array
+from torchgrasp.app.report.stills import add_solids, to_array
 from torchgrasp.closure import ClosureResult
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.hand import Hand
@@ -81,7 +81,6 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
 
 
 def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:
-    """Return the centre of mass of a mesh [m]."""
     return torch.tensor(np.array(mesh.center_mass), dtype=torch.float64)
 
 
@@ -109,8 +108,7 @@ def _draw_stills(
     for place, solids, b in zip(places, hands, base, strict=True):
         canvas = Canvas()
         canvas.add_mesh(place, faces, OBJECT)
-        for solid in solids:
-            canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
+        add_solids(canvas, solids)
         canvas.add_table(seen + b, table)
         pictures.append(canvas.render(frame_camera(seen + b, direction, size=size), size))
     return pictures

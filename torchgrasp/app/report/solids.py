@@ -85,10 +85,10 @@ def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if shape.kind == "sphere":
         radius, centres = shape.size[0], np.zeros((1, 3))
     elif shape.kind == "box":
-        radius = min(EDGE, min(shape.size) / 4)  # thin plates stay plates
-        centres = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * (np.array(shape.size) / 2 - radius)
+        radius = min(EDGE, min(shape.half) / 2)  # thin plates stay plates
+        centres = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * (np.array(shape.half) - radius)
     else:
-        radius = min(EDGE, shape.size[0] / 2, shape.size[1] / 4)
+        radius = min(EDGE, min(shape.half) / 2)
         tilt, turn = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 40, endpoint=False))
         ball = np.stack([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)], -1)
         rim, up = (shape.size[0] - radius) * ball[:, 3], np.array([0.0, 0.0, shape.size[1] / 2 - radius])

@@ -118,7 +118,7 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     arrow, axis = 0.03, 0.6 * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
     canvas = Canvas()
-    _add_solids(canvas, solids)
+    add_solids(canvas, solids)
     canvas.add_arrows(points[0], normals[0], arrow, FINGERS[: len(hand.tips)])
     canvas.add_arrows(np.zeros((3, 3)), np.eye(3), axis, AXES)
     corners = [points[0], points[0] + arrow * normals[0], axis * np.eye(3), *(s.vertices for s in solids)]
@@ -171,7 +171,7 @@ def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[Canvas, Float[n
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals))
     _add_contacts(canvas, grasp.contacts)
-    _add_solids(canvas, solids)
+    add_solids(canvas, solids)
     return canvas, np.concatenate([vertices, *(s.vertices for s in solids)])
 
 
@@ -181,7 +181,7 @@ def _add_contacts(canvas: Canvas, contacts: Contacts) -> None:
     canvas.add_arrows(points, normals, 0.045, FINGERS[: len(points)])
 
 
-def _add_solids(canvas: Canvas, solids: list[Solid]) -> None:
+def add_solids(canvas: Canvas, solids: list[Solid]) -> None:
     """Add the links of a hand to a canvas."""
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
