@@ -10,7 +10,6 @@ from torchgrasp.files.write import sha256 as sha256, write_file as write_file
 from torchgrasp.files.write import LOCK as LOCK, begin_folder as begin_folder
 from torchgrasp.files.write import hold_file as hold_file, hold_folder as hold_folder
 from torchgrasp.files.write import temporary_folder as temporary_folder
-from torchgrasp.files.tensors import DTYPES as DTYPES, VERSION as VERSION, Recent as Recent
-from torchgrasp.files.tensors import load_tensors as load_tensors, pack_tensors as pack_tensors
-from torchgrasp.files.tensors import read_value as read_value, save_tensors as save_tensors
-from torchgrasp.files.json_files import Field as Field, read_json as read_json
+from torchgrasp.files.values import DTYPES as DTYPES, VERSION as VERSION, Field as Field, Recent as Recent
+from torchgrasp.files.values import load_tensors as load_tensors, pack_tensors as pack_tensors
+from torchgrasp.files.values import read_json as read_json, read_value as read_value, save_tensors as save_tensors
