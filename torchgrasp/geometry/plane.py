@@ -5,7 +5,6 @@ frame that only scene and camera determine, and transform the results back.
 """
 
 import dataclasses
-import functools
 import math
 from typing import Any
 
@@ -62,12 +61,6 @@ class Plane(Value):
     def horizontal(cls, height: float) -> "Plane":
         """Return the plane z = height [m]."""
         return cls(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), float(height))
-
-    @functools.cached_property
-    def components(self) -> tuple[float, float, float]:
-        """The normal as three Python numbers."""
-        x, y, z = self.normal.tolist()
-        return x, y, z
 
     @checked(gradients=True)
     def height(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:

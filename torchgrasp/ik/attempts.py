@@ -15,7 +15,14 @@ from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
-from torchgrasp.ik.candidates import PAPER_TOLERANCE, TIP_PENETRATION, GraspCandidates, GraspProblem, check_candidates
+from torchgrasp.ik.candidates import (
+    PAPER_TOLERANCE,
+    TIP_PENETRATION,
+    TIP_TOLERANCE,
+    GraspCandidates,
+    GraspProblem,
+    check_candidates,
+)
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.ranking import lexical_order, rank_in_group
@@ -33,10 +40,7 @@ def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined seeds, and a mask of the contact sets that are still `unsolved`.
-
-    The function `solves` returns which results solve their contact sets.
-    """
+    """The results of all refined seeds, and a mask of the contact sets that no result `solves`."""
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
         self.unsolved, self.solves = unsolved, solves
@@ -76,10 +80,7 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return the best grasp of each contact set, and the index of its set.
-
-    A success is best, then a failure on certified contacts, then any failure; ties are broken by score.
-    """
+    """Return the best grasp of each set, and the set's index: a success, else a failure on certified contacts."""
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~executable(grasps)
@@ -93,12 +94,19 @@ def best_first(grasps: Grasps) -> Grasps:
     return grasps[lexical_order((~executable(grasps)).int(), -grasps.score)]
 
 
-def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Grasps:
-    """Refine each seed on its fixed contacts; return checked grasps."""
+def refine_on_contacts(
+    problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, by_cobyla: bool = False
+) -> Grasps:
+    """Refine each seed on its fixed contacts; return checked grasps, with COBYLA by the paper's checks."""
     contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
-    configuration = refine(problem.hand, start, contacts, problem.world, steps=steps)
+    if by_cobyla:
+        configuration = refine_by_cobyla(problem.hand, start, contacts, problem.world)
+    else:
+        configuration = refine(problem.hand, start, contacts, problem.world, steps=steps)
     certificate, status = problem.certificate[seeds.row], torch.full_like(seeds.row, Status.OK)
-    return check_candidates(problem, GraspCandidates(configuration, contacts, certificate, seeds.permutation, status))
+    candidates = GraspCandidates(configuration, contacts, certificate, seeds.permutation, status)
+    tolerance = PAPER_TOLERANCE if by_cobyla else TIP_TOLERANCE
+    return check_candidates(problem, candidates, rolling=not by_cobyla, tolerance=tolerance)
 
 
 def try_best_seeds(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Attempts[Grasps]:
@@ -221,17 +229,9 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """
     seeds = problem.drop_unreachable(seeds)
     attempts, rows = Attempts(torch.ones_like(problem.certificate.closed), executable), seeds.row.unique()
-
-    def refine(seeds: IKSeeds) -> Grasps:
-        contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
-        configuration = refine_by_cobyla(problem.hand, start, contacts, problem.world)
-        certificate, status = problem.certificate[seeds.row], torch.full_like(seeds.row, Status.OK)
-        candidates = GraspCandidates(configuration, contacts, certificate, seeds.permutation, status)
-        return check_candidates(problem, candidates, rolling=False, tolerance=PAPER_TOLERANCE)
-
     for some in rows.split(5):  # one empty part without rows
         chosen = seeds[torch.isin(seeds.row, some)]
-        attempts.refine(chosen, _rank(problem, chosen), [1, 1], refine)
+        attempts.refine(chosen, _rank(problem, chosen), (1, 1), partial(refine_on_contacts, problem, by_cobyla=True))
         results = join(attempts.results)
         if int(executable(results).sum()) >= 10 or len(results) >= 30:
             break

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.checks import ANY, Length, Rows, checked
+from torchgrasp.checks import ANY, Length, Rows, checked, show
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance, obstacle_clearance
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import find_approach, motion_clearance
 from torchgrasp.ik.ranking import score
@@ -43,15 +43,10 @@ class GraspProblem(Value):
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.ik import PostureLibrary
-    >>> from torchgrasp.ik import nearest_postures
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    >>> middle = grasp.contacts.points[0].mean(0)
-    >>> high = lambda poses: poses[:, 2, 3] > 0.1  # or ask your arm: which palms does it bring there?
-    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), middle, high)
-    >>> seeds = nearest_postures(PostureLibrary.of(hand, 200), grasp.contacts, problem.world)
-    >>> bool((problem.drop_unreachable(seeds).obj_from_hand[:, 2, 3] > 0.1).all())
+    >>> high = lambda poses: poses[:, 2, 3] > 0.1  # or ask your arm
+    >>> GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), torch.zeros(3), high).reachable is high
     True
     """
 
@@ -72,19 +67,12 @@ class GraspProblem(Value):
 
 
 def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
-    """Return which poses the user's callable reports as reachable.
-
-    Raises:
-        BadArgument: an answer of another kind than one boolean for each pose.
-    """
+    """Return which poses the user's callable reports as reachable; raise `BadArgument` for any other answer."""
     if not len(obj_from_hand):
         return torch.zeros(0, dtype=torch.bool, device=obj_from_hand.device)
     answer = reachable(obj_from_hand)
     if not isinstance(answer, Tensor) or answer.dtype != torch.bool or answer.shape != obj_from_hand.shape[:1]:
-        found = (
-            f"{answer.dtype} of shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else type(answer).__name__
-        )
-        raise BadArgument("reachable", f"an answer of {found}", f"a tensor of {len(obj_from_hand)} booleans")
+        raise BadArgument("reachable", f"an answer of {show(answer)}", f"a tensor of {len(obj_from_hand)} booleans")
     return answer.to(obj_from_hand.device)
 
 
@@ -123,13 +111,12 @@ def measure_errors(
     """Measure geometric errors of grasps; `status` is the first error out of tolerance, NaN included.
 
     With `rolling`, round fingertips may roll on their contacts within the cones of their pads. Without, as in the
-    paper, the contact points of the pads are measured and their direction is free. `tolerance` [m] limits a tip's
-    distance from its contact.
+    paper, the contact points of the pads are measured and their direction is free. `tolerance` is that of the tips [m].
     """
     spatial = SpatialJacobian.at(hand, configuration)
-    touching, target = (
-        (hand.tips.center, tip_targets(hand, contacts)) if rolling else (hand.tips.contact, contacts.points)
-    )
+    touching, target = hand.tips.contact, contacts.points
+    if rolling:
+        touching, target = hand.tips.center, tip_targets(hand, contacts)
     error = torch.linalg.vector_norm(spatial.points(hand.tips.index, touching) - target, dim=-1)
     pads = spatial.pads.permute(2, 1, 0)
     angle = torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))  # from the inward normal
@@ -146,8 +133,9 @@ def measure_errors(
         Status.TABLE_COLLISION: table >= 0,
     }
     clearances = [links, table, between]
-    if world.guarded:
-        clearances.append(obstacle_clearance(spatial, world))
+    if world.obstacles is not None and world.guarded:
+        distance, _ = world.obstacles.field.query(spatial.sphere_centres)
+        clearances.append((distance - hand.collision_spheres.radius.to(distance)).amin(1))
         conditions[Status.NEIGHBOUR_COLLISION] = clearances[-1] >= 0
     return GraspErrors(error, angle, torch.stack(clearances).amin(0), first_violation(conditions))
 

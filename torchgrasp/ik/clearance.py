@@ -38,11 +38,8 @@ class Obstacles(Value):
 
     >>> from torchgrasp import load_scene
     >>> from torchgrasp.scene import estimate_occupancy
-    >>> scene = load_scene()
-    >>> obstacles = Obstacles.of(estimate_occupancy(scene, 1))
-    >>> neighbour = scene.cloud(2).points.double().mean(0)
-    >>> obstacles.likelihood(neighbour[None], torch.tensor([0.03]))
-    tensor(0.9000, dtype=torch.float64)
+    >>> Obstacles.of(estimate_occupancy(load_scene(), 1)).levels.tolist()
+    [0.1, 0.3, 0.5, 0.8]
     """
 
     field: SignedDistanceField
@@ -64,7 +61,7 @@ class Obstacles(Value):
         if not bool((probability >= levels[0]).any()):
             return None
         distances = torch.stack([distance_to(probability >= level, occupancy.spacing) for level in levels])
-        outside, inside = distances[levels.index(full)], depth_in(probability >= full, occupancy.spacing)
+        outside, inside = distances[levels.index(full)], distance_to(probability < full, occupancy.spacing)
         field = SignedDistanceField(occupancy.origin.double(), occupancy.spacing, outside - inside)
         return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64), hard).to(device)
 
@@ -87,17 +84,6 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
         return torch.full(region.shape, spacing * sum(region.shape), dtype=torch.float64)
     steps = torch.from_numpy(np.asarray(distance_transform_edt(~region.numpy())))
     return (spacing * (steps - 0.5)).clamp_min(0.0)
-
-
-def depth_in(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
-    """Return the depth [m] of each voxel inside a region; 0 outside."""
-    depth = torch.zeros(region.shape, dtype=torch.float64)
-    if bool(region.any()):
-        where = torch.nonzero(region)  # only the box of the region is transformed
-        low, high = (where.amin(0) - 1).clamp_min(0).tolist(), (where.amax(0) + 2).tolist()
-        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        depth[box] = distance_to(~region[box], spacing)
-    return depth
 
 
 @checked
@@ -143,10 +129,7 @@ class CollisionWorld(Value):
 
 def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
     """Return the coordinates [m] of points along a plane's normal."""
-    x, y, z = plane.components
-    if (x, y, z) == (0.0, 0.0, 1.0):  # a horizontal table
-        return points[..., 2]
-    return points[..., 0] * x + points[..., 1] * y + points[..., 2] * z
+    return points @ plane.normal.to(points)
 
 
 def collision_cost(
@@ -154,11 +137,9 @@ def collision_cost(
 ) -> Float[Tensor, "*b"]:
     """Return the sum of squared missing clearances [mm2] of a hand whose fingertips may touch the object."""
     radius, cost = spheres.radius.to(centres), centres.new_zeros(centres.shape[:-2])
-    if world.field is not None:
-        deficit = (CLEARANCE + radius - world.field.nearest_node(centres)) * ~spheres.touching
-        cost = cost + deficit.clamp_min(0).square().sum(-1)
-    if world.obstacles is not None:
-        deficit = CLEARANCE + radius - world.obstacles.field.nearest_node(centres)
+    for field in world.fields:
+        deficit = CLEARANCE + radius - field.nearest_node(centres)
+        deficit = deficit * ~spheres.touching if field is world.field else deficit
         cost = cost + deficit.clamp_min(0).square().sum(-1)
     if world.plane is not None:
         deficit = world.plane.offset + CLEARANCE * ~spheres.touching + radius - along(centres, world.plane)
@@ -229,12 +210,3 @@ def link_clearance(
     if world.plane is None:
         return links, tips, torch.full_like(tips, math.inf)
     return links, tips, (along(centres, world.plane) - radius).amin(1) - world.plane.offset
-
-
-def obstacle_clearance(spatial: SpatialJacobian, world: CollisionWorld) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of all links, fingertips included, from obstacles; infinite without obstacles."""
-    spheres = spatial.hand.collision_spheres
-    centres = spatial.sphere_centres
-    if world.obstacles is None:
-        return torch.full_like(centres[:, 0, 0], math.inf)
-    return (world.obstacles.field.query(centres)[0] - spheres.radius.to(centres)).amin(1)

@@ -24,7 +24,7 @@ from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import FlatnessConstraint, check_feasibility, flatness_constraint
-from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, with_variance
+from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet
 from torchgrasp.plan.solver import equal_tensions, normalise_tensions, project
 from torchgrasp.shape.values import SurfaceJet
 from torchgrasp.specs import ContactSpec
@@ -35,10 +35,7 @@ CONTACT_WEIGHT = 2.0
 
 
 class Stage(NamedTuple):
-    """A solver stage: number of steps, whether flatness is required, and the cost [mm2] above which a grasp is dropped.
-
-    The flatness constraint is linearised at the start of the stage.
-    """
+    """A solver stage: its steps, whether flatness is required, and the cost [mm2] above which a grasp is dropped."""
 
     steps: int
     flat: bool
@@ -51,10 +48,7 @@ STAGES = (Stage(5, False, 1e5), Stage(6, True, 1e4), Stage(7, True, 500.0), Stag
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """Hand configurations, their contact points (normalised), and the tensions between contacts.
-
-    The variance at the contacts is extrapolated linearly from the start of a stage.
-    """
+    """Hand configurations, normalised contacts and tensions; the variance is extrapolated from the stage's start."""
 
     configuration: Configuration
     points: Float[Tensor, "g f 3"]
@@ -89,7 +83,8 @@ class JointProblem:
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
         """Return all residuals [mm], and their Jacobian by all unknowns."""
         hand, shape = self.hand, self.shape
-        jet = with_variance(triple_mean_jet(shape, state.points), state.variance, state.variance_gradient)
+        mean, slope = triple_mean_jet(shape, state.points), state.variance_gradient
+        jet = SurfaceJet(**vars(mean), variance=state.variance, variance_gradient=slope)
         spatial = SpatialJacobian.at(hand, state.configuration)
         contacts = Contacts(shape.metres(state.points), jet.normals)
         tips = tip_rows(spatial, tip_targets(hand, contacts), jet.normals)
@@ -134,10 +129,7 @@ class JointProblem:
     def solve(
         self, configuration: Configuration, points: Float[Tensor, "g f 3"]
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
-        """Return hand configurations and contacts that satisfy all constraints as far as possible.
-
-        Contacts are normalised. Grasps of high cost are dropped; the last result gives the indices of the others.
-        """
+        """Return configurations, normalised contacts and their indices; grasps of high cost are dropped."""
         largest, radius = self.spec.flatness, self.spec.ring_radius
         rows, tension = torch.arange(len(points), device=points.device), equal_tensions(points)
         for stage in STAGES:
@@ -185,8 +177,7 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
     of the contact planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
-    >>> from torchgrasp.ik import PostureLibrary
-    >>> from torchgrasp.ik import CollisionWorld, nearest_postures
+    >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> middle = grasp.contacts.points[0].mean(0)

@@ -17,6 +17,7 @@ from torchgrasp.values import Grasps
 
 APPROACH_DISTANCE = 0.1  # length [m] of the straight approach: about the depth of a hand
 COARSE_STEPS, FINE_STEPS = 8, 16  # positions on each candidate path, and on a chosen path
+Spheres = Float[Tensor, "g s 3"]
 
 
 def find_approach(
@@ -24,9 +25,7 @@ def find_approach(
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
     """Return an approach direction for each pre-grasp, and the least clearance [m] along its path.
 
-    Candidates are the hand's approach axis, directions tilted from it and, above a table, straight down. They are
-    sorted by approximate clearance, from the nearest nodes of the distance field. The first path without a collision is
-    chosen, or else the path of greatest clearance.
+    Of the candidates, sorted by approximate clearance, the first without a collision is chosen, or else the clearest.
     """
     spheres = hand.collision_spheres
     centres = SpatialJacobian.at(hand, opened).sphere_centres
@@ -58,11 +57,7 @@ def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) 
 
 
 def _clearance(
-    centres: Float[Tensor, "g s 3"],
-    radius: Float[Tensor, "s"],
-    direction: Float[Tensor, "g 3"],
-    world: CollisionWorld,
-    exact: bool,
+    centres: Spheres, radius: Float[Tensor, "s"], direction: Float[Tensor, "g 3"], world: CollisionWorld, exact: bool
 ) -> Float[Tensor, "g"]:
     """Return the least clearance [m] of spheres on a straight path to the pre-grasp, `exact` or by nearest nodes."""
     steps = FINE_STEPS if exact else COARSE_STEPS
@@ -108,9 +103,8 @@ def collision_probability(
     approach = opened[:, None] - back[:, None, None] * grasps.approach[:, None, None]
     closing, lift = _closing(hand, configuration, grasps.pregrasp), _lift(hand, configuration, up)
     centres = torch.cat([approach, closing, lift], 1)
-    return obstacles.likelihood(
-        centres.flatten(1, 2), hand.collision_spheres.radius.to(centres).repeat(centres.shape[1])
-    )
+    radius = hand.collision_spheres.radius.to(centres).repeat(centres.shape[1])
+    return obstacles.likelihood(centres.flatten(1, 2), radius)
 
 
 @checked

@@ -63,10 +63,7 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
 
 
 def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
-    """Return the geometric score of grasps, at most 0; higher is better.
-
-    One point is lost by 20 mm between the centroid and `center`, by a unit of friction, or by 0.8 rad off the pads.
-    """
+    """Return the geometric score, at most 0: distance from the centre, friction needed, and angle off the pads."""
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(offset / 0.02 + centred_friction(contacts) + normal_angle.amax(1) / 0.8)
 
@@ -74,8 +71,7 @@ def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[
 def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
     """Return the lever arm of a load at `center` about the longest side of the contacts' triangle, over its height.
 
-    The object turns most easily about this side: only the third contact resists, by a lever of the triangle's height,
-    and torsion, by a lever of 10 mm. For more than three contacts the best three count.
+    The object turns most easily about this side. For more than three contacts the best three count.
     """
     if points.shape[1] > 3:
         triples = torch.tensor(list(itertools.combinations(range(points.shape[1]), 3)), device=points.device)
@@ -86,14 +82,13 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
     opposite = points.gather(1, (longest + 2) % 3)[:, 0]
     arm = torch.linalg.vector_norm(torch.linalg.cross(along, center - foot), dim=-1)
     height = torch.linalg.vector_norm(torch.linalg.cross(along, opposite - foot), dim=-1)
-    return arm / (height + 0.01)
+    return arm / (height + 0.01)  # [m], the lever of torsion
 
 
 def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
     """Return the lever [m] of each finger's joints about the normal of its contact: the norm of their moment arms.
 
-    Joints of stiffness k yield by lever^2 / k under a unit force along the normal. If the surface is off by e, the
-    force of the finger is off by k e / lever^2. A finger that points along its normal has no lever.
+    If the surface is off by e, the force of a finger with joints of stiffness k is off by k e / lever^2.
     """
     joints = grasps.joints
     hand_from_obj, coupling = inverse(grasps.obj_from_hand.to(joints)), hand.actuated.coupling.to(joints)
@@ -105,24 +100,13 @@ def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
 def success_features(
     hand: Hand, shape: ShapeGP, grasps: Grasps, center: Float[Tensor, "3"], friction: float, seed: int = 0
 ) -> Float[Tensor, "g k"]:
-    """Return the `FEATURES` of each grasp, input of the success model.
-
-    Args:
-        hand: the hand; it follows the grasps to their device.
-        shape: the uncertain shape.
-        grasps: planned grasps on its surface.
-        center: estimated centre of mass of the object [m].
-        friction: friction coefficient between fingertips and object.
-        seed: random seed.
-    """
+    """Return the `FEATURES` of each grasp, input of the success model; `center` [m] is the estimated centre of mass."""
     contacts = grasps.contacts
     points, normals = contacts.points.to(shape.x), contacts.normals.to(shape.x)
     center = center.to(points)
     closure = torch.logit(closure_share(shape, contacts, friction, 600, seed).to(points), eps=1e-3)
     forces = least_friction_forces(points, normals, strongest=1.0)
-    least = torch.atan(tangential_ratio(forces, normals).amax(-1)).nan_to_num(
-        math.pi / 2
-    )  # no balance: at any friction
+    least = torch.atan(tangential_ratio(forces, normals).amax(-1)).nan_to_num(math.pi / 2)  # NaN: no balance
     arm = torch.log(load_arm(points, center) + LEAST_ARM)
     least_lever = finger_levers(hand, grasps).amin(1).to(points)
     free, straight = 0.07, 0.01  # [m] more lever is no better; keeps the logarithm of a straight finger finite
@@ -132,25 +116,18 @@ def success_features(
 
 @functools.cache
 def _read_model() -> dict[str, Any]:
-    """Return the content of `MODEL`."""
     return json.loads(MODEL.read_text("utf-8"))
 
 
 def success_log_odds(features: Float[Tensor, "g k"], hand: str) -> Float[Tensor, "g"]:
-    """Return the log-odds log(p / (1 - p)) of success of grasps with the hand of this name.
-
-    A hand without trials in the training data gets the least bias of the other hands.
-    """
+    """Return the log-odds of success of grasps with a hand, by name; an untried hand gets the least bias of all."""
     model = _read_model()
     bias = model["bias"].get(hand, min(model["bias"].values()))
     return features @ features.new_tensor([model["weights"][name] for name in FEATURES]) + bias
 
 
 def is_known(shape: ShapeGP, grasps: Grasps, friction: float) -> Bool[Tensor, "g"]:
-    """Return for which grasps trials or lifts support the prediction: by friction, size, deviation at contacts.
-
-    More friction than in the trials counts as known: it does not make a grasp worse.
-    """
+    """Return for which grasps trials or lifts support the prediction: by friction, size, deviation at contacts."""
     tried = _read_model()["range"]
     alike = friction >= tried["least_friction"] and tried["half_size"][0] <= shape.scale <= largest_known()
     return alike & (grasps.contacts.require_std().amax(1) <= tried["most_deviation"])
@@ -176,11 +153,7 @@ def by_success(grasps: Grasps) -> Grasps:
 
 
 def rank_by_variance(grasps: Grasps) -> Grasps:
-    """Sort grasps: executable grasps first, by increasing sum of the contacts' variances (Sec. 6.5).
-
-    Raises:
-        BadArgument: contacts without `variance`.
-    """
+    """Sort grasps: executable ones first, by increasing sum of their contacts' variances (Sec. 6.5)."""
     if grasps.contacts.variance is None:
         raise BadArgument("grasps.contacts.variance", "None", "the variance of the surface at each contact")
     return grasps[lexical_order((grasps.status != Status.OK).int(), grasps.contacts.variance.sum(1))]

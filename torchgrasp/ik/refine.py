@@ -62,10 +62,9 @@ def refine(
     solved: float = SOLVED,
     steps: int = ITERATIONS,
 ) -> Configuration:
-    """Return configurations in which finger i touches contact i and links are clear, as far as possible.
+    """Return configurations in which finger i touches contact i and, with a world, links are clear, if possible.
 
-    A configuration is done when its sum of squared residuals [mm2] is below `solved`. Without a world no collision is
-    avoided.
+    A configuration is done when its sum of squared residuals [mm2] is below `solved`.
     """
     target, normals = tip_targets(hand, contacts), contacts.normals
 
@@ -79,10 +78,7 @@ def refine(
 def open_hand(
     hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Float[Tensor, "g h"]:
-    """Return the joints of the pre-grasp: each tip is moved off its contact along the normal, and every link is clear.
-
-    The pose is that of the grasp. The distance is 12 mm plus three standard deviations of the surface.
-    """
+    """Return the joints of the pre-grasp: each tip is moved off its contact along the normal; links are clear."""
     normals, gap = contacts.normals, 0.012 + 3.0 * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
     if world.plane is not None:

@@ -86,11 +86,7 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the frame of three to five points: axes of their triangle's `virtual_frame`, origin at their centroid.
-
-    Raises:
-        DegenerateContacts: the triangle is too flat.
-    """
+    """Return the frame of three to five points: axes of their triangle's `virtual_frame`, origin at their centroid."""
     return rigid(virtual_frame(triangle_of(points))[..., :3, :3], points.mean(-2))
 
 
@@ -198,16 +194,9 @@ def query_mixture(
 ) -> IKSeeds:
     """Return seeds near the contacts from the learned model, for all six assignments (Eqs. 21-24).
 
-    For every assignment within reach (Eq. 21) the joints are the conditional mean (Eq. 23) and the means of the most
-    responsible components, clamped to the limits. Eq. (24) gives the pose. Fingertips are still centimetres away from
-    their contacts. Seeds are in the order of the contact sets; within a set, seeds on the right side of the surface
-    come first, then by tip error. An unreachable contact set has no seeds.
-
-    Args:
-        contacts: contact sets (b, 3) on the object; hand and mixture are moved to their device.
-        mixture: the hand's learned model.
-        n_seeds: seeds for each assignment, at most one more than the mixture has components.
-        max_energy: largest distance of a code from the nearest component, f_i of Eq. (21); the paper's: `PAPER_ENERGY`.
+    For every assignment within reach (Eq. 21: `max_energy`) the joints are the conditional mean (Eq. 23) and the means
+    of the most responsible components, `n_seeds` in all. Within a contact set, seeds on the right side of the surface
+    come first, then by tip error. An unreachable set has no seeds.
 
     Raises:
         BadArgument: a mixture of another hand, limits or fingertips, a number out of range, or malformed contacts.

@@ -51,7 +51,8 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec
-    points, normals = _checked(contacts)
+    points, normals = (x.detach().double().cpu() for x in (check_contacts(contacts).points, contacts.normals))
+    check_unit(normals)
     finite = torch.isfinite(points).flatten(1).all(-1) & torch.isfinite(normals).flatten(1).all(-1)
     margin, ratio, residual = (torch.full((len(points),), torch.nan, dtype=torch.float64) for _ in range(3))
     witness = torch.full((len(points), 6), torch.nan, dtype=torch.float64)
@@ -86,24 +87,18 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Te
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
-    """Return the upper bound of the margin that a witness proves; NaN for a witness that proves nothing.
-
-    With g_k = w.w_k, phi = s + psi and psi >= 0: 0 = sum phi g >= s sum g + (1 - m s) min g.
-    Hence s <= -min g / sum(g - min g).
-    """
+    """Return the upper bound of the margin that a witness proves; NaN for a witness that proves nothing."""
+    # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g / sum(g - min g).
     product = (wrench @ witness[..., None])[..., 0]
     least = product.amin(-1)
     return -least / (product - least[:, None]).sum(-1)
 
 
 def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]:
-    """Return margin, residual max |W phi| and witness for one matrix of m wrenches, by HiGHS.
-
-    The linear programme has seven equations in the margin s and psi = phi - s >= 0.
-    """
+    """Return margin, residual max |W phi| and witness for one matrix of m wrenches, by HiGHS."""
     from scipy.optimize import linprog
 
-    m = len(wrench)
+    m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
     equations = np.zeros((7, m + 1))
     equations[:6, :m], equations[:6, m] = wrench.T, wrench.sum(0)
     equations[6, :m], equations[6, m] = 1.0, m
@@ -145,9 +140,3 @@ def check_contacts(contacts: Contacts) -> Contacts:
         allowed = f"{FINGERTIPS[0]} to {FINGERTIPS[1]}, one for each fingertip"
         raise BadArgument("contacts.points", f"{points.shape[1]} contacts a row", allowed)
     return contacts
-
-
-def _checked(contacts: Contacts) -> tuple[Vectors, Vectors]:
-    """Return checked contact points and normals in float64 on the CPU."""
-    points = check_contacts(contacts).points
-    return points.detach().double().cpu(), check_unit(contacts.normals.detach().double().cpu())

@@ -54,10 +54,8 @@ def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Te
 def tangents(points: Vectors, normals: Vectors) -> Vectors:
     """Return a unit tangent at each contact that rotates with the object: the first edge of its friction cone.
 
-    It lies in the plane of three contacts. For four or five contacts, the three are chosen whose plane is the most
-    perpendicular to the contact's tangent plane, weighted by area. The tangent is arbitrary for contacts on a line, and
-    for three contacts with a normal perpendicular to their plane, where friction cannot give closure. In that case a
-    tangent of four or five contacts points to the farthest contact.
+    It lies in the plane of three contacts: of four or five, those whose plane is the most perpendicular to the tangent
+    plane, weighted by area. It is arbitrary where no plane gives a tangent and friction cannot give closure.
     """
     first, second, third = subsets(points.shape[1], 3, points.device).unbind(1)
     plane = torch.linalg.cross(points[:, second] - points[:, first], points[:, third] - points[:, first])  # (b, k, 3)
@@ -109,11 +107,7 @@ def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
 def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
     """Return the coefficients phi of the greatest margin of each grasp, and the unit witness of that margin.
 
-    Rounding, degenerate wrenches or too few pivots may spoil both, so `certify` checks them. If no coefficients
-    balance, the witness has positive products with all wrenches, and phi is meaningless.
-
-    Args:
-        wrench: the primitive wrenches, float64.
+    Rounding or too few pivots may spoil both: check them. If nothing balances, the witness proves it, and phi is void.
     """
     return in_chunks(_solve, wrench, GRASPS_PER_CHUNK)  # pyright: ignore[reportReturnType]
 
@@ -175,15 +169,9 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
 def closed_exact(
     points: Vectors, normals: Vectors, friction: float, guess: Float[Tensor, "b m"] | None = None
 ) -> Bool[Tensor, "b"]:
-    """Return which contact sets have frictional form closure with round cones.
+    """Return which contact sets have frictional form closure with round cones; borderline sets have not.
 
-    Degenerate, non-finite and borderline sets are not closed.
-
-    Args:
-        points: contact points, three to five in a set.
-        normals: outward unit normals.
-        friction: coefficient of friction.
-        guess: coefficients phi from `first_balance` for similar contacts, to save time; None: no guess.
+    `guess` holds coefficients phi from `first_balance` for similar contacts, to save time.
     """
     if points.shape[1] == 3:
         return _closed_in_plane(points, normals, friction) & ~degenerate(points)
@@ -196,11 +184,10 @@ def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[T
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
-    """Return which sets of three contacts are closed.
+    """Return which sets of three contacts are closed: balanced forces lie in their plane.
 
-    Balanced forces lie in the plane of the contacts. Each cone cuts an angle about the projected normal from it. The
-    six planar wrenches along these angles must positively span the planar wrenches: no plane through two of them has
-    the others on one side.
+    Each cone cuts an angle from the plane. The six planar wrenches along the sides of these angles must positively span
+    the planar wrenches: no plane through two of them has the others on one side.
     """
     centre, radius = centre_and_radius(points)
     arm = (points - centre) / radius
@@ -265,11 +252,7 @@ def _corrected(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Flo
 def most_opposing(
     points: Vectors, normals: Vectors, friction: float, witness: Float[Tensor, "b 6"]
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 6"]]:
-    """Return, for each contact, the wrench in its round cone with the least product with the witness, and this product.
-
-    With u = witness force + witness torque x arm, a force pushes along u at least where its friction points against the
-    tangential part of u.
-    """
+    """Return for each contact the least product of a wrench in its round cone with the witness, and this wrench."""
     centre, radius = centre_and_radius(points)
     arm = (points - centre) / radius
     force, torque = witness[:, None].expand(-1, points.shape[1], -1).split(3, -1)

@@ -59,12 +59,6 @@ def grid() -> Float[Tensor, "23"]:
     return torch.tensor([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64)
 
 
-@functools.cache
-def grid_weights() -> Float[Tensor, "23 5"]:
-    """Return the weights (23, 5) that interpolate deviations at the nodes of a line to its grid."""
-    return interpolation(grid(), torch.tensor(NODES, dtype=torch.float64))
-
-
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
     """Return the weights that interpolate linearly between nodes in descending order; constant outside."""
     held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
@@ -80,12 +74,7 @@ def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
-    """Return the posterior of the surface along the normals of all contacts.
-
-    Raises:
-        BadArgument: contacts of a wrong shape, not finite, within a footprint of the domain's edge, or normals not of
-            length 1.
-    """
+    """Return the posterior of the surface along the normals of all contacts; raises as `closure_probability`."""
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
         check_tensor(f"contacts.{name}", value, (len(contacts), f, 3))
@@ -118,14 +107,12 @@ def _along_lines(
     shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]]:
     """Return standard deviation, mean distance on the grid, mean gradient and covariance at the nodes, for one wall."""
-    # Rows whose joint posterior is made at a time: 105 x 105 distances of three contacts, which stay in the cache
-    rows_per_chunk = 32
     jet = shape.jet(points.flatten(0, 1))
     deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
     values = 4 * len(NODES) * points.shape[1]
     covariance = points.new_empty(len(points), values, values)
-    for rows in torch.arange(len(points), device=points.device).split(rows_per_chunk):
+    for rows in torch.arange(len(points), device=points.device).split(32):  # the distances of a part stay in the cache
         covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
     slope = shape.mean_and_gradient((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
     t = deviation[..., None] * grid().to(deviation)
@@ -136,10 +123,7 @@ def _along_lines(
 def node_covariance(
     shape: ShapeGP, points: Vectors, normals: Vectors, nodes: Float[Tensor, "b f 5"]
 ) -> Float[Tensor, "b z z"]:
-    """Return the posterior covariance of (d, w) at all nodes; the gradient w is a difference quotient of d.
-
-    Nodes outside the domain take the covariance at its edge.
-    """
+    """Return the posterior covariance of (d, w) at all nodes, or at the domain's edge; w is a difference quotient."""
     width = FOOTPRINT / shape.scale
     along = (points * normals).sum(-1)
     half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
@@ -160,15 +144,15 @@ def first_contact(
 ) -> tuple[Float[Tensor, "b n f 3"], Float[Tensor, "b n f 3"]]:
     """Return where fingertips touch n drawn surfaces, and the normals there; NaN where a line meets no surface."""
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
-    distance = lines.distance[:, None] + deviation[..., 0] @ grid_weights().to(drawn).T
+    t, nodes = grid().to(drawn), torch.tensor(NODES).to(drawn)
+    distance = lines.distance[:, None] + deviation[..., 0] @ interpolation(t, nodes).T
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
-    t = grid().to(drawn)
     far = torch.where(crosses, t[:-1].abs(), torch.inf)
     nearest, before = far.min(-1, keepdim=True)
     high, low = distance.gather(-1, before), distance.gather(-1, before + 1)
     stop = torch.lerp(t[before], t[before + 1], high / (high - low))
     stop = torch.where(torch.isinf(nearest), torch.nan, stop)
-    weights = interpolation(stop, torch.tensor(NODES).to(stop))  # (b, n, f, 1, k)
+    weights = interpolation(stop, nodes)  # (b, n, f, 1, k)
     slope = lines.slope[:, None] + deviation[..., 1:]
     motion = stop * lines.deviation[:, None, :, None]
     return lines.points[:, None] + motion * lines.normals[:, None], unit((weights @ slope)[..., 0, :])

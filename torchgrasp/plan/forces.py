@@ -46,10 +46,9 @@ def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
 
 
 def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"]:
-    """Return unit internal forces of all p pairs of contacts: `[..., k, i, :]` acts on contact i in pair k.
+    """Return unit internal forces of all p `contact_pairs`: `[..., k, i, :]` acts on contact i in pair k.
 
-    The two forces of a pair cancel. All pairs span the null space of the grasp map, except for four or five contacts in
-    one plane. `contact_pairs` gives the order.
+    They span the null space of the grasp map, except for four or five contacts in one plane.
     """
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)
@@ -149,14 +148,8 @@ def _search_steps() -> tuple[Float[Tensor, "3 s"], ...]:
 def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "b f"], slack: float) -> Vectors:
     """Return balanced forces that need nearly the least friction, near the preferred normal forces.
 
-    Args:
-        points: contacts, in any unit.
-        normals: outward unit normals.
-        preferred: preferred normal forces.
-        slack: tangent of the cones beyond the ratio needed. More slack gives forces nearer to the preferred ones.
-
-    Returns:
-        Forces; NaN rows where no balanced forces push at every contact within `MAX_FRICTION`.
+    More `slack`, the tangent of the cones beyond the ratio needed, gives forces nearer to the preferred ones. A row is
+    NaN where no balanced forces push at every contact within `MAX_FRICTION`.
     """
     basis = _null_space(points)  # (b, f, 3, k)
     push = -(normals[..., None] * basis).sum(2)  # (b, f, k): a = push z

@@ -78,11 +78,6 @@ def triple_mean_jet(shape: Shape, points: Vectors) -> MeanJet:
     return MeanJet(*(x.unflatten(0, points.shape[:2]) for x in (jet.distance, jet.gradient, jet.hessian)))
 
 
-def with_variance(jet: MeanJet, variance: Float[Tensor, "b f"], gradient: Float[Tensor, "b f 3"]) -> SurfaceJet:
-    """Return the mean's derivatives together with a given variance and its gradient."""
-    return SurfaceJet(jet.distance, jet.gradient, jet.hessian, variance, gradient)
-
-
 @functools.cache
 def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
     """Return the indices of all p pairs of contacts: neighbours (i, i + 1) first, then (i, i + 2)."""
@@ -131,10 +126,7 @@ class Constraints(Batch):
 
 
 def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
-    """Return the forces on the object at the contacts, and the vector from the first to the second of each pair.
-
-    The tension of a pair pulls its two contacts together with a force of tension times distance.
-    """
+    """Return the forces at the contacts and the vector from first to second of each pair; force: tension x vector."""
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]
     return pull_signs(points.shape[1], points.device).to(points) @ (tension[..., None] * sides), sides
@@ -236,11 +228,8 @@ class ContactProblem:
     def _cones(
         self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet
     ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f u"]]:
-        """Return by how much each force is outside its friction cone, as a cosine, with derivatives.
-
-        With u = f / |f| the bound is n.u + cosine. Its derivatives are (1 - u u^T) n / |f| by the force, and u by the
-        normal, which turns with its point.
-        """
+        """Return by how much each force is outside its friction cone, as a cosine, with derivatives."""
+        # With u = f / |f| the bound is n.u + cosine. It changes by (1 - u u^T) n / |f| with f, and by u with n.
         normals, at = jet.normals, torch.arange(points.shape[1], device=points.device)
         force, sides = forces_from_tensions(points, tension)
         size = torch.linalg.vector_norm(force, dim=-1, keepdim=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgrasp.base import join, pick, put
 from torchgrasp.checks import Count, Positive, Seed, checked
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.errors import Status
 from torchgrasp.plan.closure import Vectors
 from torchgrasp.plan.feasibility import check_feasibility
 from torchgrasp.plan.problem import ContactProblem, Shape
@@ -29,8 +29,6 @@ The last two give way where the centre cannot be reached."""
 TO_CENTRE = (Stage(centre=0.3, cones=3.0, steps=8, exact=False),)
 """The stage from rows of candidates, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
 LEAST_STARTS = 25  # fewest starts at a time under a time budget: with less, the overhead of each step outweighs them
-Chunk = tuple[Float[Tensor, "_ f 3"], tuple[Stage, ...]]
-"""Normalised starts on the surface, and the stages from there."""
 
 
 @checked
@@ -65,23 +63,15 @@ def plan_contacts(
     torch.Size([8, 3, 3])
     """
     spec = ContactSpec() if spec is None else spec
-    check_starts(shape, spec, starts, seed)
+    check_starts(shape, spec, starts)
     settled = settle_flatness(shape, spec, seed)
-    spec = settled.spec
-    if time_budget is not None and not time_budget > 0:  # also refuses NaN
-        raise BadArgument("time_budget", time_budget, "a positive number of seconds, or None")
-    chunks = _chunks(shape, settled, starts, seed)
-    if time_budget is not None:
-        chunks = _within(time_budget, chunks)
-    return join([plan_chunk(shape, spec, first, stages) for first, stages in chunks])
-
-
-def _chunks(shape: Shape, settled: Settled, starts: int | Vectors, seed: int) -> Iterator[Chunk]:
-    """Yield the initial guesses chunk by chunk, each with the solver stages that it needs."""
     if isinstance(starts, Tensor):
-        return ((first, SEARCH) for first in given_starts(shape, starts))
-    first_stages = _stages(settled.spec)
-    return ((first, first_stages) for first in drawn_starts(shape, settled, chunk_sizes(starts), seed))
+        stages, firsts = SEARCH, given_starts(shape, starts)
+    else:
+        stages, firsts = _stages(settled.spec), drawn_starts(shape, settled, chunk_sizes(starts), seed)
+    if time_budget is not None:
+        firsts = _within(time_budget, firsts)
+    return join([plan_chunk(shape, settled.spec, first, stages) for first in firsts])
 
 
 def _stages(spec: ContactSpec) -> tuple[Stage, ...]:
@@ -97,17 +87,17 @@ def plan_in_turn(shape: Shape, settled: Settled, sizes: Sequence[int], seed: int
         yield join([plan_chunk(shape, spec, next(starts), _stages(spec)) for _ in parts])
 
 
-def _within(seconds: float, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
+def _within(seconds: float, firsts: Iterator[Vectors]) -> Iterator[Vectors]:
     """Yield as many initial guesses as can be planned in the given time, judged by the speed so far."""
     began, done, fits = time.monotonic(), 0, LEAST_STARTS
-    for first, stages in chunks:
+    for first in firsts:
         while len(first) > 0:
             if done:
                 used = time.monotonic() - began
                 fits = int((seconds - used) * done / used)
             if fits < LEAST_STARTS:
                 return
-            yield first[:fits], stages
+            yield first[:fits]
             done, first = done + len(first[:fits]), first[fits:]
 
 

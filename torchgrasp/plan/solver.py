@@ -23,7 +23,6 @@ from torchgrasp.plan.problem import (
     split_unknowns,
     triple_jet,
     triple_mean_jet,
-    with_variance,
 )
 from torchgrasp.shape.surface import newton_step
 
@@ -36,10 +35,9 @@ BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cone
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A solver stage: at most `steps` steps with constant weights of `centre` (Eq. 14) and friction `cones` (Eq. 13).
+    """A solver stage: at most `steps` steps with weights of `centre` (Eq. 14) and friction `cones` (Eq. 13).
 
-    A contact set stops when its next step is shorter than `settled`. With `exact` the variance, the most expensive
-    value, is evaluated at every step; without, it is extrapolated linearly from the first state.
+    A set stops when its step is shorter than `settled`. Unless `exact`, the variance is extrapolated linearly.
     """
 
     centre: float
@@ -123,7 +121,8 @@ class Descent(Problem[State, LinearConstraints]):
             return State(points, tension, triple_jet(self.shape, points))
         slope = state.jet.variance_gradient
         variance = state.jet.variance + (slope * (points - state.points)).sum(-1)
-        return State(points, tension, with_variance(triple_mean_jet(self.shape, points), variance, slope))
+        mean = triple_mean_jet(self.shape, points)
+        return State(points, tension, SurfaceJet(**vars(mean), variance=variance, variance_gradient=slope))
 
     def judge(
         self, model: LinearConstraints, trial: LinearConstraints, x: Float[Tensor, "a u"], damping: Damping
@@ -135,11 +134,8 @@ class Descent(Problem[State, LinearConstraints]):
         return accepted, torch.where(accepted, eased.clamp(min=1e-9), (4 * damping).clamp(max=1e9))
 
     def refuse(self, model: LinearConstraints, trial: LinearConstraints) -> LinearConstraints:
-        """Return the model after a rejected step: its Jacobian is the mean of those at both ends of the step.
-
-        Near an observation a thin plate's normals change abruptly, and steps from either side lead across the kink. The
-        mean Jacobian points down along the kink.
-        """
+        """Return the model after a rejected step: its Jacobian is the mean of those at both ends of the step."""
+        # Near an observation a thin plate's normals change abruptly. The mean Jacobian points down along the kink.
         return dataclasses.replace(model, jacobian=(model.jacobian + trial.jacobian) / 2)
 
 

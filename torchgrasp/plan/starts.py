@@ -32,7 +32,7 @@ hand then gets a hundred triples of a thousand starts."""
 STARTS_PER_CHUNK = 500  # starts planned at once: memory is bounded, and a plan from fewer starts begins one from more
 
 
-def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor, seed: int) -> None:
+def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor) -> None:
     """Raise `BadArgument` for wrong initial guesses of `plan_contacts`."""
     if isinstance(starts, Tensor):
         if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
@@ -76,9 +76,8 @@ class Settled(NamedTuple):
 def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
     """Yield random initial guesses on the surface in normalised units, `sizes[k]` at a time.
 
-    Without `spec.flatness` they are the paper's: points on the sphere of `spec.start_radius`, moved onto the surface
-    (Sec. 6.2). With flatness they are sets of candidate contacts. The centroid of a flat grasp may lie 30 mm from the
-    object's centre, where the paper's guesses rarely lead.
+    Without `spec.flatness` they are the paper's (Sec. 6.2); with flatness they are sets of candidate contacts, because
+    the centroid of a flat grasp may lie far from the object's centre.
     """
     (spec, candidates), generator = settled, torch.Generator().manual_seed(seed)
     if candidates is not None:
@@ -92,10 +91,9 @@ def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int
 
 
 def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
-    """Choose the `flat_radius` of a specification that has none, and find the candidate contacts on flat surface.
+    """Choose the largest `flat_radius` at which enough guesses are closed, if none is given; find flat candidates.
 
-    The radius is the largest of `FLAT_RADII` at which enough initial guesses have form closure. If too few points are
-    flat, all points of `survey` are candidates.
+    If too few points are flat, all points of `survey` are candidates.
     """
     if spec.flatness is None:
         return Settled(spec, None)
@@ -131,8 +129,7 @@ def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float
 def draw_in(shape: Shape, points: Vectors) -> Vectors:
     """Return initial guesses in which contact sets far from the surface are moved close to their centroid.
 
-    Far from the surface a point is only a direction. From far away it would end on the nearest surface. From near the
-    centroid the points spread over the surface around it, as Eq. (14) wants.
+    From near the centroid the points spread over the surface around it; from afar they end on the nearest surface.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR

@@ -81,7 +81,7 @@ class Planner:
         No batch begins after `deadline`, a time of `time.monotonic`.
         """
         problem, request = self.problem, self.problem.request
-        check_starts(problem.shape, problem.given_spec, request.starts, request.seed)
+        check_starts(problem.shape, problem.given_spec, request.starts)
         most = TRIED if problem.scene is None else TRIED_IN_SCENE
         batches = schedule(request.starts, most) if request.mode == "joint" else [Batch(request.starts, most)]
         sizes = [batch.starts for batch in batches if batch.starts]

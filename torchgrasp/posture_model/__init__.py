@@ -9,19 +9,7 @@ from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
 
 __all__ = [
-    "encode",
-    "HandSamples",
-    "SampleSpec",
-    "sample_configurations",
-    "SampleFolder",
-    "write_samples",
-    "load_samples",
-    "Components",
-    "Progress",
-    "fit_mixture",
-    "GaussianMixture",
-    "GraspMixture",
-    "PAPER_ENERGY",
-    "DEFAULT_ENERGY",
+    "encode", "HandSamples", "SampleSpec", "sample_configurations", "SampleFolder", "write_samples", "load_samples",
+    "Components", "Progress", "fit_mixture", "GaussianMixture", "GraspMixture", "PAPER_ENERGY", "DEFAULT_ENERGY",
     "load_mixture",
-]
+]  # fmt: skip

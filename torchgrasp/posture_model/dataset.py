@@ -6,6 +6,7 @@ import operator
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -46,20 +47,15 @@ class SampleFolder:
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.posture_model import SampleSpec
     >>> folder = write_samples(load_hand("barrett"), SampleSpec(100), tempfile.mkdtemp())
-    >>> len(folder), folder.holds(0), folder.path(0).name
-    (100, True, 'chunk-000000.safetensors')
-    >>> folder.read(10).joints.shape, len(folder.chunk(0))
-    (torch.Size([10, 4]), 100)
-    >>> joints, code = folder[-1]
+    >>> len(folder), folder.read(10).joints.shape, folder[-1][1].shape
+    (100, torch.Size([10, 4]), torch.Size([6]))
     """
 
     folder: Path
     n: int
     joint_names: tuple[str, ...]
     meta: dict[str, str]
-    recent: Recent[HandSamples] = dataclasses.field(
-        default_factory=lambda: Recent[HandSamples](KEPT), repr=False, compare=False
-    )
+    recent: Recent[HandSamples] = dataclasses.field(default_factory=lambda: Recent(KEPT), repr=False, compare=False)
 
     def __len__(self) -> int:
         return self.n
@@ -79,11 +75,10 @@ class SampleFolder:
         sizes = chunk_sizes(self.n)
         if i >= len(sizes):
             raise BadArgument("i", i, f"a chunk in [0, {len(sizes) - 1}]")
-        path, count = self.path(i), sizes[i]
+        path = self.path(i)
         tensors, meta = load_tensors(path, "samples", {"joints", "q"})
-        shapes = tuple(tuple(tensors[name].shape) for name in ("joints", "q"))
-        wanted = (count, len(self.joint_names)), (count, 6)
-        if shapes != wanted:
+        shapes = tuple(tensors["joints"].shape), tuple(tensors["q"].shape)
+        if shapes != (wanted := ((sizes[i], len(self.joint_names)), (sizes[i], 6))):
             raise ModelFileError("path", f"{path}: tensors of shapes {shapes}", f"shapes {wanted}")
         if {key: meta.get(key) for key in self.meta} != self.meta or meta.get("chunk") != str(i):
             raise ModelFileError("path", f"{path}: the chunk of other samples", f"chunk {i} of {self.meta}")
@@ -131,10 +126,8 @@ def write_samples(
     >>> import tempfile
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.posture_model import SampleSpec
-    >>> told = []
-    >>> _ = write_samples(load_hand("barrett"), SampleSpec(100), tempfile.mkdtemp(), observer=told.append)
-    >>> told
-    [0, 100]
+    >>> len(write_samples(load_hand("barrett"), SampleSpec(100), tempfile.mkdtemp()))
+    100
     """
     counts, meta = chunk_sizes(spec.n), spec.meta(hand)
     samples = SampleFolder(Path(folder), spec.n, hand.joint_names, meta)
@@ -172,18 +165,12 @@ def load_samples(folder: Path | str) -> SampleFolder:
 
     >>> import tempfile
     >>> from torchgrasp.hand.load import load_hand
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = write_samples(load_hand("barrett"), SampleSpec(100), folder)
-    ...     load_samples(folder).read(50).joints.shape
+    >>> folder = write_samples(load_hand("barrett"), SampleSpec(100), tempfile.mkdtemp()).folder
+    >>> load_samples(folder).read(50).joints.shape
     torch.Size([50, 4])
     """
-    max_manifest = 1024 * 1024  # most bytes of a manifest: the file of a stranger must not fill the memory
-    folder = Path(folder)
-
-    def refuse(found: str, allowed: str) -> ModelFileError:
-        return ModelFileError("folder", found, allowed)
-
-    manifest = read_json(folder / MANIFEST, refuse, "a folder written by write_samples", max_manifest)
+    folder, refuse = Path(folder), partial(ModelFileError, "folder")
+    manifest = read_json(folder / MANIFEST, refuse, "a folder written by write_samples", 2**20)
     samples = _parse_manifest(folder, manifest)
     chunks = len(chunk_sizes(samples.n))
     if missing := sum(not samples.path(i).is_file() for i in range(chunks)):

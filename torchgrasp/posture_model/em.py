@@ -118,11 +118,9 @@ def expectation_maximisation(
 
 def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
     """Return the sums of the features weighted by responsibilities, and the log-likelihood of all data, Eq. (19)."""
-    # Rows of one pass on a GPU, which smaller passes leave idle; features take 200 MB (`scripts/bench.py gpu`)
-    gpu_rows = 2**17
     x, coefficients = shard.rows, coefficients_from_components(components)
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
-    at_once = min(CACHED_ROWS if x.device.type == "cpu" else gpu_rows, len(x))
+    at_once = min(CACHED_ROWS if x.device.type == "cpu" else 2**17, len(x))  # smaller passes leave a GPU idle
     features, joint = x.new_empty(coefficients.shape[1], at_once), x.new_empty(len(coefficients), at_once)  # reused
     floor = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; denormal numbers are slow
     for rows in x.split(at_once):
@@ -164,11 +162,10 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
 def maximisation(
     sums: Float[Tensor, "m f"], n: int, regularisation: float, reseeded: Int[Tensor, "m"]
 ) -> tuple[Components, Int[Tensor, "m"]]:
-    """Return the maximum-likelihood components from the weighted sums; collapsed components are placed anew.
+    """Return the maximum-likelihood components from the weighted sums, and how often each has collapsed.
 
-    A component collapses if its covariance is singular or its responsibilities sum to less than d + 1 rows. It is
-    replaced by half of the heaviest component, split across its longest axis. Raises `IndefiniteCovariance` if every
-    component collapses, or one of them more than `MAX_RESEEDS` times. `reseeded` counts the collapses.
+    A component collapses if its covariance is singular or it has fewer than d + 1 rows. Half of the heaviest, split
+    across its longest axis, replaces it, at most `MAX_RESEEDS` times: then `IndefiniteCovariance` is raised.
     """
     components = components_from_sums(sums, n, regularisation)
     weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()
@@ -209,11 +206,10 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
 
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
     """Return m initial components, the clusters of k-means; raises `BadArgument` for fewer than m distinct rows."""
-    rounds = 10  # rounds of Lloyd's algorithm: EM follows, so the clusters need not converge
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
-    for _ in range(rounds):
-        sums = _sums_of_clusters(shard, centres, _ones_and_data)
+    for _ in range(10):  # Lloyd's algorithm: EM follows, so the clusters need not converge
+        sums = _sums_of_clusters(shard, centres, lambda x: torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T)
         centres = torch.where(sums[:, :1] > 0, sums[:, 1:] / sums[:, :1], centres)  # a centre without data stays
     sums = _sums_of_clusters(shard, centres, features_from_data)
     n = round(float(sums[:, 0].sum()))
@@ -223,13 +219,11 @@ def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> 
 
 def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]:
     """Return random rows of the data of all processes, the same in every process."""
-    subsample = 20_000  # rows among which k-means++ chooses its centres: some hundred for each component
-    x = shard.rows
-    lengths = x.new_zeros(shard.processes, dtype=torch.int64)
+    x, lengths = shard.rows, shard.rows.new_zeros(shard.processes, dtype=torch.int64)
     lengths[shard.rank] = len(x)
     lengths = shard.sum(lengths)
     order = torch.randperm(int(lengths.sum()), generator=generator)  # the same for any number of processes
-    pick = order[:subsample].to(x.device) - lengths[: shard.rank].sum()
+    pick = order[:20_000].to(x.device) - lengths[: shard.rank].sum()  # some hundred for each component
     here = (pick >= 0) & (pick < len(x))
     pool = x.new_zeros(len(pick), x.shape[1])
     pool[here] = x[pick[here]]
@@ -259,7 +253,3 @@ def _sums_of_clusters(
         member = nearest[:, None] == torch.arange(len(centres), device=rows.device)
         sums.addmm_(member.T.to(rows), features(rows).T)
     return shard.sum(sums)
-
-
-def _ones_and_data(x: Float[Tensor, "r d"]) -> Float[Tensor, "f r"]:
-    return torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T

@@ -32,10 +32,8 @@ DEFAULT_ENERGY = 6.295793622
 def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b q"]:
     """Return the rigid-motion-invariant code q = (L, N) of points with unit normals, Eq. (18).
 
-    L_i is the distance [m] of point i from the centroid; N holds the cosines n1.n2, n1.n3, n2.n3 and so on. For three
-    points, as in the paper, the code has six numbers. Negated normals have the same code, so fingertips have the code
-    of the contacts that they touch. Mirror images also share the code, and so do normals that are rotated together:
-    check every match.
+    L_i is the distance [m] of point i from the centroid; N holds the cosines n1.n2, n1.n3, n2.n3 and so on. Fingertips
+    have the code of the contacts that they touch. Mirror images share it too: check every match.
     """
     lengths = torch.linalg.vector_norm(points - points.mean(-2, keepdim=True), dim=-1)
     cosines = torch.stack([(n * m).sum(-1) for n, m in itertools.combinations(normals.unbind(-2), 2)], dim=-1)
@@ -83,12 +81,7 @@ def describe_compatibility(hand: Hand) -> dict[str, str]:
 
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
-    """Raise `BadArgument` for a model of another hand, or of other fingers, joint limits or fingertips.
-
-    If `meta` has no `hand_codes`, only the joint names are compared.
-    """
-    # Largest difference of two codes [m or cosine] by rounding: `describe_compatibility` writes seven digits
-    tolerance = 1e-5
+    """Raise `BadArgument` for a model of another hand, or of other fingers, joint limits or fingertips."""
     if joint_names != hand.joint_names:
         raise BadArgument("mixture", f"joints {joint_names}", f"the joints {hand.joint_names} of the hand")
     if "hand_codes" not in meta:
@@ -98,7 +91,9 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
         theirs = torch.tensor([float(x) for x in meta["hand_codes"].split()], dtype=torch.float64)
     except ValueError as error:
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
-    if theirs.shape != ours.shape or not torch.allclose(theirs.to(ours), ours, rtol=0, atol=tolerance):
+    if theirs.shape != ours.shape or not torch.allclose(
+        theirs.to(ours), ours, rtol=0, atol=1e-5
+    ):  # seven digits were written
         whose = f"hand {meta.get('hand')!r}, fingers {meta.get('fingers')!r}, of other limits or fingertips"
         allowed = f"one of {hand.name!r}, {hand.source.option!r}: train it anew"
         raise BadArgument("mixture", f"a model of {whose}", allowed)
@@ -122,13 +117,10 @@ class GraspMixture(GaussianMixture):
     hand, samples and fit.
 
     >>> from torchgrasp import encode
-    >>> from torchgrasp.hand.load import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> model, code = load_mixture("barrett"), encode(load_shipped_grasp("jug", "barrett").contacts)
-    >>> model.energy(code).shape, model.joints(code).shape  # of the six assignments of contacts to fingers
-    (torch.Size([1, 6]), torch.Size([1, 6, 4]))
-    >>> model.modes(code.q[0], k=2)[0].shape  # of each the two likeliest postures
-    torch.Size([6, 2, 4])
+    >>> model.energy(code).shape, model.joints(code).shape, model.modes(code.q, k=2)[0].shape
+    (torch.Size([1, 6]), torch.Size([1, 6, 4]), torch.Size([1, 6, 2, 4]))
     """
 
     regularisation: float = 0.0

@@ -8,6 +8,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
@@ -33,8 +34,7 @@ def roll_contacts(
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
     """Return random contact points [m] and outward normals of fingertips that touch beside the middle of their pads.
 
-    The two tilts of a contact direction from the pad's axis are Gaussian with deviation `ROLL`, truncated to the pad's
-    cone. The contact point of a round tip follows the direction. A flat tip keeps its contact point and only tilts.
+    Both tilts of a contact direction are Gaussian, truncated to the pad's cone. The contact of a round tip follows.
     """
     points, axes = hand.fingertips(joints)
     cone, radius = hand.tips.cone.to(axes), hand.tips.radius.to(axes)
@@ -49,8 +49,7 @@ def roll_contacts(
 def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -> Bool[Tensor, "n"]:
     """Return which postures have three contacts that balance forces inside the friction cones, Eq. (13).
 
-    Balanced forces of three contacts act along the triangle's sides; a grid over them finds all but marginal closures.
-    `normals` point out of the fingertips, into the object.
+    A grid over forces along the triangle's sides finds all but marginal closures; `normals` point into the object.
     """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for three in itertools.combinations(range(points.shape[1]), 3):
@@ -153,7 +152,7 @@ def sample_configurations(
         hand.require_three("sampling", "'grasping'")
     parts = []
     with ThreadPoolExecutor(workers) as pool:
-        for part in pool.map(lambda i: draw_chunk(hand, spec, i), range(len(chunk_sizes(n)))):
+        for part in pool.map(partial(draw_chunk, hand, spec), range(len(chunk_sizes(n)))):
             parts.append(part)
             observer(len(part[0]))
     joints, q, _ = zip(*parts, strict=True)

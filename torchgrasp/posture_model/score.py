@@ -117,7 +117,7 @@ def bic_curve(
     observer: Callable[[int, GraspMixture], object] = lambda m, mixture: None,
     **fit: Any,
 ) -> BicCurve:
-    """Fit a mixture for each number of components, and return the BIC of each (Fig. 6 b, d).
+    """Fit a mixture for each number of components, and return the BIC of each (Fig. 6 b, d); raises as `fit_mixture`.
 
     Codes of "uniform" samples are exact functions of the joints, so the BIC falls without end. For "grasping" samples,
     whose fingertips roll, the BIC has a minimum.
@@ -128,10 +128,6 @@ def bic_curve(
         checkpoints: folder for the checkpoints of all fits; an interrupted call continues from them.
         observer: called after each fit with its number of components and its mixture.
         fit: seed, iterations, tolerance and regularisation of `fit_mixture`.
-
-    Raises:
-        BadArgument: no number to try, or what `fit_mixture` refuses.
-        IndefiniteCovariance, ModelFileError, OutputError: as `fit_mixture`.
     """
     if not components:
         raise BadArgument("components", "none", "at least one number")

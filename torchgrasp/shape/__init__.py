@@ -9,20 +9,7 @@ from torchgrasp.shape.surface import Surface, extract_surface, surface_field
 from torchgrasp.shape.values import JointEstimate, Normalisation, Observations, ShapeDerivatives
 
 __all__ = [
-    "HollowShape",
-    "JointEstimate",
-    "Kernel",
-    "Normalisation",
-    "Observations",
-    "ShapeDerivatives",
-    "ShapeGP",
-    "SignedDistanceField",
-    "Surface",
-    "condition",
-    "extract_surface",
-    "fit_shape",
-    "matern52_kernel",
-    "rbf_kernel",
-    "surface_field",
-    "thin_plate_kernel",
-]
+    "HollowShape", "JointEstimate", "Kernel", "Normalisation", "Observations", "ShapeDerivatives", "ShapeGP",
+    "SignedDistanceField", "Surface", "condition", "extract_surface", "fit_shape", "matern52_kernel", "rbf_kernel",
+    "surface_field", "thin_plate_kernel",
+]  # fmt: skip
