@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgrasp.errors import IndefiniteCovariance
 
+Points = Float[Tensor, "n 3"]
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # golden section of the full circle [rad]
 
 

@@ -60,9 +60,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
     """Raise `MeshError` unless a mesh encloses a volume."""
     if not 0 < len(mesh.faces) <= MESH_FACES:
-        raise MeshError(
-            "mesh", f"{name} of {len(mesh.faces)} faces", f"a closed mesh of at most {MESH_FACES} triangles"
-        )
+        allowed = f"a closed mesh of at most {MESH_FACES} triangles"
+        raise MeshError("mesh", f"{name} of {len(mesh.faces)} faces", allowed)
     if mesh.faces.shape[1] != 3 or mesh.vertices.shape[1] != 3:
         found = f"{name} of faces {mesh.faces.shape} and vertices {mesh.vertices.shape}"
         raise MeshError("mesh", found, "triangles in space")
@@ -106,12 +105,7 @@ def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.
 def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the part of a mesh where a field is negative, and a mask of the vertices made by the cut.
 
-    Triangles are cut along the zero level; the field is linear within each triangle.
-
-    Args:
-        vertices: vertices (v, 3).
-        faces: triangles (f, 3).
-        values: the field at the vertices (v,).
+    `values` (v,) is the field at the `vertices` (v, 3); it is linear within each of the `faces` (f, 3).
     """
     keep = values < 0
     count = keep[faces].sum(1)
@@ -143,12 +137,7 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Read a mesh from the bytes of a file with trimesh; a malformed file may raise any exception.
-
-    Args:
-        data: content of the file.
-        suffix: one of `SUFFIXES`.
-        options: options of `trimesh.load_mesh`.
+    """Read a mesh from the bytes of a file with `trimesh.load_mesh`; a malformed file may raise any exception.
 
     Raises:
         ValueError: more than `MESH_FACES`, or a header beyond `PLY_PROPERTIES` or `PLY_HEADER_BYTES`.

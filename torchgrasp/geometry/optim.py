@@ -26,7 +26,8 @@ class Linearisation(Batch):
 
 
 Damping = Float[Tensor, "a"]
-Steps = tuple[Float[Tensor, "a d"], Bool[Tensor, "a"]]
+Step = Float[Tensor, "a d"]
+Steps = tuple[Step, Bool[Tensor, "a"]]
 """A step of each row, and whether the row goes on; a row that does not has ended."""
 Verdict = tuple[Bool[Tensor, "a"], Damping]
 """Which steps are accepted, and the damping of the next ones."""
@@ -48,11 +49,11 @@ class Problem(abc.ABC, Generic[State, Model]):
         """Return the solution of the damped normal equations, and which problems go on."""
 
     @abc.abstractmethod
-    def move(self, state: State, x: Float[Tensor, "a d"]) -> State:
+    def move(self, state: State, x: Step) -> State:
         """Return the states after a step."""
 
     @abc.abstractmethod
-    def judge(self, model: Model, trial: Model, x: Float[Tensor, "a d"], damping: Damping) -> Verdict:
+    def judge(self, model: Model, trial: Model, x: Step, damping: Damping) -> Verdict:
         """Return which steps are accepted, and the next damping, given the models before and after the step."""
 
     def refuse(self, model: Model, trial: Model) -> Model:
@@ -130,13 +131,11 @@ class LeastSquares(Problem[State, LinearResiduals]):
         x = x * (self.largest / x.abs().amax(1, keepdim=True).clamp_min(self.largest))
         return x, ~(model.cost < self.solved) & torch.isfinite(damping)
 
-    def move(self, state: State, x: Float[Tensor, "a d"]) -> State:
+    def move(self, state: State, x: Step) -> State:
         """Return the states after a step."""
         return self.moved(state, x)
 
-    def judge(
-        self, model: LinearResiduals, trial: LinearResiduals, x: Float[Tensor, "a d"], damping: Damping
-    ) -> Verdict:
+    def judge(self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping) -> Verdict:
         """Accept a step that lowers the cost; stop a problem that has converged or is stuck."""
         lost = 30.0  # damping beyond which a refused step ends a row of `LeastSquares`
         stalled = 0.02  # relative decrease of the sum of squares below which a row of `LeastSquares` has converged

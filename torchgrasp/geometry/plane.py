@@ -44,8 +44,9 @@ class Plane(Value):
     Raises:
         BadArgument: the normal is not of unit length, or a number is not finite.
 
-    >>> Plane.horizontal(0.1).height(torch.tensor([0.0, 0.0, 0.3]))
-    tensor(0.2000)
+    >>> plane = Plane.horizontal(0.1)
+    >>> plane.describe(), plane.height(torch.tensor([0.0, 0.0, 0.3]))
+    ('normal 0 0 1, offset 0.1', tensor(0.2000))
     """
 
     normal: Float[Tensor, "3"]
@@ -69,22 +70,12 @@ class Plane(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Plane":
-        """Return the plane transformed from frame a to frame b.
-
-        >>> floor_from_table = torch.eye(4)
-        >>> floor_from_table[2, 3] = 0.5
-        >>> Plane.horizontal(0.1).moved(floor_from_table).offset
-        0.6
-        """
+        """Return the plane transformed from frame a to frame b."""
         normal = b_from_a[:3, :3].double() @ self.normal.double()
         return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))
 
     def describe(self) -> str:
-        """Return normal and offset as text.
-
-        >>> Plane.horizontal(0.1).describe()
-        'normal 0 0 1, offset 0.1'
-        """
+        """Return normal and offset as text."""
         x, y, z = self.normal.tolist()
         return f"normal {x:.9g} {y:.9g} {z:.9g}, offset {self.offset:.9g}"
 
@@ -107,11 +98,6 @@ def upright_frame(
     of the points. The x axis is horizontal and points towards the camera. If the camera is straight above, x points to
     the point farthest from the vertical through the points' centroid. The origin is on this vertical, on the table if
     there is one.
-
-    Args:
-        points: points of a cloud [m].
-        viewpoint: position of the camera [m], or one position for each point.
-        table: table plane in the frame of the points.
 
     Raises:
         BadArgument: most points are below the table.

@@ -27,12 +27,10 @@ FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an est
 class SignedDistanceField(Value):
     """Signed distances [m] on a grid, negative inside; node i is at origin + i * spacing.
 
-    >>> nodes = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3)
-    >>> ball = nodes.norm(dim=1).reshape(41, 41, 41) - 0.05
-    >>> field = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball)
-    >>> distance, gradient = field.query(torch.tensor([0.0, 0.0, 0.08]))
-    >>> f"{distance:.3f}", gradient.round(), f"{field.nearest_node(torch.tensor([0.0, 0.0, 0.02])):.3f}"
-    ('0.030', tensor([0., 0., 1.]), '-0.030')
+    >>> ball = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3).norm(dim=1).reshape(41, 41, 41) - 0.05
+    >>> distance, gradient = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball).query(torch.tensor([0, 0, 0.08]))
+    >>> f"{distance:.3f}", gradient.round()
+    ('0.030', tensor([0., 0., 1.]))
     """
 
     origin: Float[Tensor, "3"]

@@ -94,19 +94,17 @@ def best_first(grasps: Grasps) -> Grasps:
     return grasps[lexical_order((~executable(grasps)).int(), -grasps.score)]
 
 
-def refine_on_contacts(
-    problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, by_cobyla: bool = False
-) -> Grasps:
+def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, cobyla: bool = False) -> Grasps:
     """Refine each seed on its fixed contacts; return checked grasps, with COBYLA by the paper's checks."""
     contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
-    if by_cobyla:
+    if cobyla:
         configuration = refine_by_cobyla(problem.hand, start, contacts, problem.world)
     else:
         configuration = refine(problem.hand, start, contacts, problem.world, steps=steps)
     certificate, status = problem.certificate[seeds.row], torch.full_like(seeds.row, Status.OK)
     candidates = GraspCandidates(configuration, contacts, certificate, seeds.permutation, status)
-    tolerance = PAPER_TOLERANCE if by_cobyla else TIP_TOLERANCE
-    return check_candidates(problem, candidates, rolling=not by_cobyla, tolerance=tolerance)
+    tolerance = PAPER_TOLERANCE if cobyla else TIP_TOLERANCE
+    return check_candidates(problem, candidates, rolling=not cobyla, tolerance=tolerance)
 
 
 def try_best_seeds(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Attempts[Grasps]:
@@ -142,14 +140,12 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     return best_first(best_grasps(attempts)[0])
 
 
-def refine_by_cobyla(
-    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
-) -> Configuration:
+def refine_by_cobyla(hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld) -> Configuration:
     """Return the configurations at which COBYLA stops; only the joints of the initial configurations are used."""
-    if not len(configuration):
-        return configuration
-    rows = [CobylaRun(hand, q, p, world).solve() for q, p in zip(configuration.joints, contacts.points, strict=True)]
-    return join(rows).to(configuration.joints.dtype)
+    if not len(start):
+        return start
+    rows = [CobylaRun(hand, q, p, world).solve() for q, p in zip(start.joints, contacts.points, strict=True)]
+    return join(rows).to(start.joints.dtype)
 
 
 class CobylaRun:
@@ -231,7 +227,7 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     attempts, rows = Attempts(torch.ones_like(problem.certificate.closed), executable), seeds.row.unique()
     for some in rows.split(5):  # one empty part without rows
         chosen = seeds[torch.isin(seeds.row, some)]
-        attempts.refine(chosen, _rank(problem, chosen), (1, 1), partial(refine_on_contacts, problem, by_cobyla=True))
+        attempts.refine(chosen, _rank(problem, chosen), (1, 1), partial(refine_on_contacts, problem, cobyla=True))
         results = join(attempts.results)
         if int(executable(results).sum()) >= 10 or len(results) >= 30:
             break

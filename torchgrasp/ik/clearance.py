@@ -195,9 +195,7 @@ def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: boo
     return [Rows((CLEARANCE - clearance).clamp_min(0) / MILLIMETRE, wrench, moves)]
 
 
-def link_clearance(
-    spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
-) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"], Float[Tensor, "g"]]:
+def link_clearance(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Float[Tensor, "g"]]:
     """Return least clearances [m]: links from the object, touching tips from the object, all from the table."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres
@@ -208,5 +206,5 @@ def link_clearance(
     tips = clearance[:, spheres.touching].amin(1)
     links = clearance[:, ~spheres.touching].amin(1) if tips_touch else clearance.amin(1)
     if world.plane is None:
-        return links, tips, torch.full_like(tips, math.inf)
-    return links, tips, (along(centres, world.plane) - radius).amin(1) - world.plane.offset
+        return [links, tips, torch.full_like(tips, math.inf)]
+    return [links, tips, (along(centres, world.plane) - radius).amin(1) - world.plane.offset]

@@ -75,9 +75,7 @@ def refine(
     return levenberg_marquardt(problem, configuration, steps)[0]
 
 
-def open_hand(
-    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
-) -> Float[Tensor, "g h"]:
+def open_hand(hand: Hand, grasp: Configuration, contacts: Contacts, world: CollisionWorld) -> Float[Tensor, "g h"]:
     """Return the joints of the pre-grasp: each tip is moved off its contact along the normal; links are clear."""
     normals, gap = contacts.normals, 0.012 + 3.0 * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
@@ -94,4 +92,4 @@ def open_hand(
         return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))  # the pose is fixed
 
     problem = LeastSquares(evaluate, integrate, solved=1.0, largest=HAND_STEP)  # half a millimetre at a tip
-    return levenberg_marquardt(problem, configuration, steps=12)[0].joints
+    return levenberg_marquardt(problem, grasp, steps=12)[0].joints

@@ -141,11 +141,9 @@ def _refine_seeds(hand: Hand, contacts: Contacts, world: CollisionWorld, method:
     return join(parts)
 
 
-def refine_exactly(
-    hand: Hand, configuration: Configuration, contacts: Contacts, world: CollisionWorld
-) -> Configuration:
+def refine_exactly(hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld) -> Configuration:
     """Refine with a margin of clearance, then without margin; keep the second result where links stay clear."""
-    refined = refine(hand, configuration, contacts, world, EXACT)
+    refined = refine(hand, start, contacts, world, EXACT)
     settled = refine(hand, refined, contacts, None, EXACT)
     return pick(measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined)
 

@@ -26,6 +26,8 @@ from torchgrasp.geometry.linalg import unit
 
 Vectors = Float[Tensor, "b f 3"]
 """A vector at each of the contacts in every row: points or normals."""
+Guess = Float[Tensor, "b m"] | None
+"""Coefficients of the first wrenches of each cone, for a start."""
 BALANCED = 1e-9  # largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about 1)
 MIN_MARGIN = 1e-6
 """Least positive coefficient: far above the certificate's errors, far below equal coefficients, 1 / (f e)."""
@@ -166,9 +168,7 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
     return phi, witness / torch.linalg.vector_norm(witness, dim=1, keepdim=True)
 
 
-def closed_exact(
-    points: Vectors, normals: Vectors, friction: float, guess: Float[Tensor, "b m"] | None = None
-) -> Bool[Tensor, "b"]:
+def closed_exact(points: Vectors, normals: Vectors, friction: float, guess: Guess = None) -> Bool[Tensor, "b"]:
     """Return which contact sets have frictional form closure with round cones; borderline sets have not.
 
     `guess` holds coefficients phi from `first_balance` for similar contacts, to save time.
@@ -211,9 +211,7 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
     return spanned & (projected > cone).all(-1)
 
 
-def _closed_by_proof(
-    points: Vectors, normals: Vectors, friction: float, guess: Float[Tensor, "b m"] | None
-) -> Bool[Tensor, "b"]:
+def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: Guess) -> Bool[Tensor, "b"]:
     """Return which sets of four or five contacts are closed: cones get more edges until each verdict is proven."""
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches

@@ -139,9 +139,10 @@ def node_covariance(
     return combined_covariance(shape, queries.flatten(1, 2), weights.repeat_interleave(len(NODES), 1))
 
 
-def first_contact(
-    lines: LinePosterior, drawn: Float[Tensor, "b n z"]
-) -> tuple[Float[Tensor, "b n f 3"], Float[Tensor, "b n f 3"]]:
+Touches = Float[Tensor, "b n f 3"]
+
+
+def first_contact(lines: LinePosterior, drawn: Float[Tensor, "b n z"]) -> tuple[Touches, Touches]:
     """Return where fingertips touch n drawn surfaces, and the normals there; NaN where a line meets no surface."""
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
     t, nodes = grid().to(drawn), torch.tensor(NODES).to(drawn)
@@ -196,12 +197,10 @@ def closure_probability(
     Raises:
         BadArgument: a wrong argument, or a contact that is not finite or outside the shape's domain.
 
-    >>> from torchgrasp.geometry.linalg import unit
-    >>> from torchgrasp import PointCloud, fit_shape
-    >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
-    >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
-    >>> contacts = Contacts(0.04 * corners, corners)
-    >>> closure_probability(fit_shape(PointCloud(0.04 * ball, ball)), contacts).probability > 0.9
+    >>> from torchgrasp import fit_shape, load_object
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> contacts = load_shipped_grasp("jug", "barrett").contacts
+    >>> closure_probability(fit_shape(load_object("jug").view), contacts).probability > 0.5
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec

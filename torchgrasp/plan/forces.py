@@ -36,6 +36,9 @@ SLACK = 0.04  # tangent that four or five contacts may need beyond the least one
 STEPS, KEPT = 30, 0.3
 """Newton steps, and the share of tau's distance from the needed ratio that remains after each step."""
 MAX_FRICTION = 10.0  # tangent of the widest friction cones in which forces are sought
+Push = Float[Tensor, "b f k"]
+Slide = Float[Tensor, "b f 3 k"]
+"""The map from coordinates in the null space to normal forces, and to tangential forces."""
 
 
 def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
@@ -202,16 +205,14 @@ def _null_space(points: Vectors) -> Float[Tensor, "b f 3 k"]:
 
 
 def _sizes(
-    push: Float[Tensor, "b f k"], slide: Float[Tensor, "b f 3 k"], z: Float[Tensor, "b l k"]
+    push: Push, slide: Slide, z: Float[Tensor, "b l k"]
 ) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:
     """Return the sizes of normal and tangential forces for l coordinate vectors z."""
     tangential = (slide.flatten(1, 2) @ z.mT).unflatten(1, slide.shape[1:3])  # (b, f, 3, l)
     return z @ push.mT, torch.linalg.vector_norm(tangential, dim=2).mT
 
 
-def _needed(
-    push: Float[Tensor, "b f k"], slide: Float[Tensor, "b f 3 k"], z: Float[Tensor, "b k"]
-) -> Float[Tensor, "b"]:
+def _needed(push: Push, slide: Slide, z: Float[Tensor, "b k"]) -> Float[Tensor, "b"]:
     """Return the largest ratio of tangential to normal force over the contacts: the friction needed."""
     normal, tangential = _sizes(push, slide, z[:, None])
     return (tangential / normal)[:, 0].amax(1)

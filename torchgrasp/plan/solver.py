@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch
 from torchgrasp.geometry.linalg import limit_norm
-from torchgrasp.geometry.optim import Damping, Linearisation, Problem, Steps, Verdict, levenberg_marquardt
+from torchgrasp.geometry.optim import Damping, Linearisation, Problem, Step, Steps, Verdict, levenberg_marquardt
 from torchgrasp.plan.closure import Vectors
 from torchgrasp.plan.problem import (
     ContactProblem,
@@ -112,7 +112,7 @@ class Descent(Problem[State, LinearConstraints]):
         shrink = (length / LONGEST_STEP).clamp(min=1.0)
         return x / shrink[:, None], length / shrink > self.stage.settled  # NaN is not longer
 
-    def move(self, state: State, x: Float[Tensor, "a u"]) -> State:
+    def move(self, state: State, x: Step) -> State:
         """Return the state after a step x; the contacts move along the surface."""
         by_points, by_tension = split_unknowns(x)
         points = project(self.shape, state.points + by_points, steps=1)
@@ -124,9 +124,7 @@ class Descent(Problem[State, LinearConstraints]):
         mean = triple_mean_jet(self.shape, points)
         return State(points, tension, SurfaceJet(**vars(mean), variance=variance, variance_gradient=slope))
 
-    def judge(
-        self, model: LinearConstraints, trial: LinearConstraints, x: Float[Tensor, "a u"], damping: Damping
-    ) -> Verdict:
+    def judge(self, model: LinearConstraints, trial: LinearConstraints, x: Step, damping: Damping) -> Verdict:
         """Return which steps lower the cost inside the domain, and the next damping (Nielsen's rule)."""
         kept = (model.cost - trial.cost) / promised_decrease(model, x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
@@ -139,7 +137,7 @@ class Descent(Problem[State, LinearConstraints]):
         return dataclasses.replace(model, jacobian=(model.jacobian + trial.jacobian) / 2)
 
 
-def promised_decrease(model: LinearConstraints, x: Float[Tensor, "a u"]) -> Float[Tensor, "a"]:
+def promised_decrease(model: LinearConstraints, x: Step) -> Float[Tensor, "a"]:
     """Return the decrease of the cost that the linear model predicts for a step x."""
     linear = model.residual + (model.weighted_jacobian @ x[..., None])[..., 0]
     return (model.residual.square().sum(1) - linear.square().sum(1)) / 2

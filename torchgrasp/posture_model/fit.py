@@ -155,14 +155,8 @@ def fit_mixture(
         "log_likelihood": f"{log_likelihood:.6f}",
         "bic": f"{-2 * n * log_likelihood + parameters * math.log(n):.1f}",
     }
-    return GraspMixture(
-        weights=fit.components.weights,
-        means=fit.components.means * scale + centre,
-        covariances=fit.components.covariances * scale[:, None] * scale,
-        names=names,
-        regularisation=regularisation,
-        meta=samples.meta | report,
-    )
+    means, covariances = fit.components.means * scale + centre, fit.components.covariances * scale[:, None] * scale
+    return GraspMixture(fit.components.weights, means, covariances, names, regularisation, samples.meta | report)
 
 
 def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:

@@ -45,32 +45,30 @@ def longest_distance(x: Float[Tensor, "n 3"]) -> float:
     return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
 
 
-def append_observations(
-    posterior: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None
-) -> Posterior:
-    """Return the posterior given `new` observations besides the old: equal to conditioning on all at once.
+def append_observations(old: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None) -> Posterior:
+    """Return the old given `new` observations besides the old: equal to conditioning on all at once.
 
     The factor L grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
     `shared` are correlated errors of the new distances, one column for each independent cause.
     """
-    kernel = posterior.kernel
+    kernel = old.kernel
     if shared is not None:
         shared = shared[torch.argsort(~new.has_normal, stable=True)]
     new = new.with_normals_first()
     y, noise = new.rows()
     fresh = int(new.has_normal.sum())
-    cross = covariance_rows(kernel, posterior.x, posterior.n_oriented, new.x, fresh)
+    cross = covariance_rows(kernel, old.x, old.n_oriented, new.x, fresh)
     own = gram(kernel, new.x, fresh) + torch.diag_embed(noise)
     if shared is not None:
         own[: len(new.x), : len(new.x)] += shared @ shared.T
-    before = torch.linalg.solve_triangular(posterior.factor, posterior.ordered(cross), upper=False)
+    before = torch.linalg.solve_triangular(old.factor, old.ordered(cross), upper=False)
     corner = cholesky(own - before.T @ before, "the covariance of new observations", kernel.remedy)
-    factor = torch.cat([torch.cat([posterior.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)])
+    factor = torch.cat([torch.cat([old.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)])
 
     # L^-1 y of the old rows is L^T times their weights; the observed numbers themselves need not be kept.
-    whitened = posterior.factor.T @ posterior.ordered(posterior.weights)
+    whitened = old.factor.T @ old.ordered(old.weights)
     rest = torch.linalg.solve_triangular(corner, (y - before.T @ whitened)[:, None], upper=False)[:, 0]
-    return _extend(posterior, new, factor, torch.cat([whitened, rest]))
+    return _extend(old, new, factor, torch.cat([whitened, rest]))
 
 
 @dataclasses.dataclass(frozen=True)

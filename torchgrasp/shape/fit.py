@@ -30,7 +30,7 @@ from torchgrasp.shape.conditioning import (
     select_points,
 )
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.hollow import HollowShape, tie_walls, vessel_supports
+from torchgrasp.shape.hollow import HollowShape, tie_walls
 from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.support import (
     FREE_NOISE,
@@ -39,6 +39,7 @@ from torchgrasp.shape.support import (
     camera_support,
     free_space_violations,
     paper_support,
+    vessel_supports,
 )
 from torchgrasp.shape.values import Normalisation, Observations, off_surface, on_surface
 from torchgrasp.threads import single_threaded

@@ -3,33 +3,19 @@
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, join, map_tensors
+from torchgrasp.base import map_tensors
 from torchgrasp.checks import Pose, checked
-from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere
-from torchgrasp.shape.completion.complete import LEAST_NOISE, correlated_errors
-from torchgrasp.shape.completion.silhouette import TIE, Outlines
-from torchgrasp.shape.completion.vessel import FORM_ERROR, RIM, HiddenWall, Vessel, Wall, complete_walls, lid
+from torchgrasp.geometry.linalg import farthest_points
+from torchgrasp.shape.completion.silhouette import TIE
 from torchgrasp.shape.gp import ShapeGP, common_fields
-from torchgrasp.shape.support import (
-    HIDDEN_NORMAL_NOISE,
-    NORMAL_NOISE,
-    OUTER_POINTS,
-    OUTER_RADIUS,
-    RIM_NOISE,
-    STD_FACTORS,
-    Part,
-    Support,
-    frame_around,
-    free_space,
-    observe,
-)
-from torchgrasp.shape.values import JointEstimate, MeanJet, Normalisation, Observations, SurfaceJet, off_surface
+from torchgrasp.shape.support import Middle
+from torchgrasp.shape.values import JointEstimate, MeanJet, Observations, SurfaceJet, off_surface
 from torchgrasp.values import PointCloud
 
 Found = TypeVar("Found")
@@ -48,11 +34,9 @@ class HollowShape(ShapeGP):
     >>> import trimesh
     >>> from torchgrasp import fit_shape
     >>> from torchgrasp.cloud import look_at, partial_view
-    >>> outline = [[0, 0], [0.04, 0], [0.04, 0.09], [0.034, 0.09], [0.034, 0.006], [0, 0.006]]
-    >>> cup = trimesh.creation.revolve(outline)  # radius and height [m]
-    >>> shape = fit_shape(partial_view(cup, look_at(0.0, 35.0, target=cup)), table=0.0)
-    >>> shape.predict(torch.tensor([[0.0, 0.0, 0.06], [0.037, 0.0, 0.06]]).double()).distance > 0
-    tensor([ True, False])
+    >>> cup = trimesh.creation.revolve([[0, 0], [0.04, 0], [0.04, 0.09], [0.034, 0.09], [0.034, 0.006], [0, 0.006]])
+    >>> type(fit_shape(partial_view(cup, look_at(0.0, 35.0, target=cup)), table=0.0)).__name__
+    'HollowShape'
     """
 
     inner: ShapeGP
@@ -140,60 +124,6 @@ class HollowShape(ShapeGP):
         return [evaluate(w, x[own]) for w, own in zip(self.walls, rows, strict=True)], lambda *y: torch.cat(y)[back]
 
 
-@dataclasses.dataclass(frozen=True)
-class Middle(Value):
-    """Points in the middle of a vessel's wall and its thickness, normalised; the wall is thicker unless `side`."""
-
-    x: Float[Tensor, "n 3"]
-    side: Bool[Tensor, "n"]
-    thickness: float
-
-
-def vessel_supports(
-    cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float, noise: float
-) -> tuple[Support, Support, Middle]:
-    """Return observations of a vessel's outer and inner surface besides the seen points, and points amid the wall.
-
-    `noise` is that of an anchor's distance, normalised. Distances of the inner surface are positive around the axis.
-    """
-    device, cloud = cloud.points.device, cloud.to("cpu")
-    frame = frame_around(cloud.points)
-    outer, inner = complete_walls(cloud, vessel, outline, table)
-    hidden = join([outer.hidden, lid(vessel)])
-    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64)])
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    sphere = frame.metres(OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS))
-
-    def anchors(points: Float[Tensor, "n 3"], distance: Float[Tensor, "n"]) -> Observations:
-        return off_surface(frame.normalise(points), distance / frame.scale, noise)
-
-    surface = torch.cat([cloud.points[outer.seen], hidden.points])
-    middle = (axis + 0.5 * (table + vessel.rim) * up)[None]
-    depth = torch.minimum(torch.cdist(middle, surface).amin(1), middle[:, 2] - table)
-    body = anchors(torch.cat([middle, sphere]), torch.cat([-depth, torch.cdist(sphere, surface).amin(1)]))
-    rim = observe(frame, outline.rim, outline.rim_normals, RIM_NOISE, 2 * HIDDEN_NORMAL_NOISE)
-
-    surface = torch.cat([cloud.points[inner.seen], inner.hidden.points])
-    bottom = float(surface[:, 2].min())
-    over = vessel.rim + 0.5 * vessel.radius  # there the inner surface still surrounds free space: it has no lid
-    inside = axis + torch.tensor([0.5 * (bottom + vessel.rim), vessel.rim, over]).double()[:, None] * up
-    around = sphere[sphere[:, 2] < vessel.rim]
-    clear = torch.cat([torch.cdist(inside, surface).amin(1), -torch.cdist(around, surface).amin(1)])
-    space = anchors(torch.cat([inside, around]), clear)
-
-    def support(anchors: Observations, parts: list[Part], free: Any, rows: Tensor) -> Support:
-        on_device = tuple((part.to(device), None if errors is None else errors.to(device)) for part, errors in parts)
-        placed, factor = (frame.to(device), anchors.to(device), NORMAL_NOISE), STD_FACTORS["vessel", True]
-        return Support(*placed, factor, on_device, free, rows.to(device), "vessel")
-
-    free = free_space(outline, frame.to(device), table)
-    return (
-        support(body, [(rim, None), _observe_hidden(frame, hidden)], free, outer.seen),
-        support(space, [_observe_hidden(frame, inner.hidden)], None, inner.seen),
-        _middle(cloud, vessel, (outer, inner), frame).to(device),
-    )
-
-
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
     """Return the vessel after adding observations that give its wall the known thickness.
 
@@ -219,24 +149,3 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
             walls.append(wall.append(known) if len(known) else wall)
         shape = HollowShape.join(walls[0], walls[1], shape.cloud)
     return shape
-
-
-def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: Normalisation) -> Middle:
-    """Return points half a thickness behind both walls, without handles and rim."""
-    assert cloud.normals is not None
-    points, normals = [], []
-    for wall, seen in zip(walls, (vessel.body & ~vessel.inner, vessel.inner), strict=True):
-        points += [cloud.points[seen], wall.hidden.points]
-        normals += [cloud.normals[seen], wall.hidden.normals]
-    at, out = torch.cat(points), torch.cat(normals)
-    below = at[:, 2] < vessel.rim - RIM
-    at, out = at[below], out[below]
-    rows = farthest_points(at, 150, tie=TIE)
-    x = frame.normalise(at[rows] - 0.5 * vessel.thickness * out[rows])
-    return Middle(x, out[rows, 2].abs() < 0.8, vessel.thickness / frame.scale)  # a floor may be thicker
-
-
-def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
-    """Return observations of a wall's hidden points, and their correlated errors."""
-    errors = correlated_errors(wall.points, wall.shared, FORM_ERROR)
-    return observe(frame, wall.points, wall.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE), errors / frame.scale

@@ -56,8 +56,7 @@ class Kernel:
 def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
     """Return k and its derivatives in u = r^2 / 2 by autograd, `count` in all, at most 4.
 
-    dk/du is k'(r) / r, whose limit at r = 0 is k''(0). Higher derivatives are set to 0 at r = 0, where they may be
-    infinite: covariances multiply them by a power of r.
+    Second and third are set to 0 at r = 0, where they may be infinite: covariances multiply them by a power of r.
     """
     k, *by_r = _differentiate_by_distance(profile, r, max(count - 1, 1))
     *_, midpoint = _differentiate_by_distance(profile, r / 2, 2)
@@ -83,11 +82,7 @@ def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[
 
 
 def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
-    """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, Eq. (6).
-
-    The kernel and its slope vanish at r = psi. It is a covariance only within a ball of diameter 3/4 psi. The paper's
-    psi, the longest distance of the data, is too small for this.
-    """
+    """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, Eq. (6): a covariance in a ball of diameter 3/4 psi."""
     # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals need it.
     return r * r * (2.0 * r - 3.0 * psi) + psi**3
 
@@ -142,11 +137,7 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return a kernel by name; all have the same prior variances, psi^3 of distance and 6 psi of slope.
-
-    Raises:
-        BadArgument: another name.
-    """
+    """Return a kernel by name; all have the same prior variances, psi^3 of distance and 6 psi of slope."""
     if name == "thin_plate":
         return thin_plate_kernel(psi)
     if name == "matern52":
@@ -159,11 +150,8 @@ def cross_covariance(
 ) -> Float[Tensor, "4 q rows"]:
     """Return the covariance of distance and gradient (d, w) at x with the observations at y, Eqs. (2)-(5).
 
-    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T. Here d = x - y, and k', k'' are derivatives in r^2 / 2.
-    Eq. (5) takes one derivative in each argument: two in one argument would make the matrix indefinite.
-
-    The first `n_oriented` of y have normals. Columns are ordered by component: d of all, then w1, w2, w3 of those with
-    normals.
+    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T with d = x - y and derivatives in r^2 / 2. Columns: d of all,
+    then w1, w2, w3 of the first `n_oriented`, which have normals.
     """
     n = len(y)
     d, r = separations(x, y)

@@ -126,13 +126,8 @@ class Posterior(Value):
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance of the distance with their derivatives at normalised points, in closed form.
 
-        (a, b) are the weights of distances and normals. With d = x - x_j, k', k'' and k''' are derivatives in
-        |d|^2 / 2.
-
-        * mean: sum_j a_j k - k' d.b_j
-        * gradient: sum_j c_j d - k' b_j with c_j = k' a_j - k'' d.b_j
-        * Hessian: sum_j (k'' a_j - k''' d.b_j) d d^T - k'' (b_j d^T + d b_j^T) + c_j I
-        * gradient of the variance k0 - k*^T A k*: -2 times the gradient of the mean with the weights A k*
+        With weights (a, b) of distances and normals, d = x - x_j and derivatives of k in |d|^2 / 2, the mean is
+        sum_j a_j k - k' d.b_j. The gradient of the variance k0 - k*^T A k* is -2 times that of a mean of weights A k*.
         """
         return SurfaceJet(*in_chunks(partial(_jet, self), x, 256 if x.device.type == "cpu" else 16384))
 
@@ -183,7 +178,8 @@ class Posterior(Value):
         return self.weights[:n], self.weights[n:].reshape(3, self.n_oriented).T
 
 
-Kernels = tuple[list[Tensor], Float[Tensor, "q n"], Float[Tensor, "q n"], Float[Tensor, "q near"]]
+Values = Float[Tensor, "q n"]
+Kernels = tuple[list[Tensor], Values, Values, Float[Tensor, "q near"]]
 """Differences from the observations, k, k' and, where there are normals, k''."""
 
 
@@ -224,9 +220,7 @@ def _jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor,
     return *mean, variance, -2.0 * explained
 
 
-def _distance_rows(
-    d: list[Tensor], k: Float[Tensor, "q n"], first: Float[Tensor, "q n"], near: int
-) -> Float[Tensor, "q rows"]:
+def _distance_rows(d: list[Tensor], k: Values, first: Values, near: int) -> Float[Tensor, "q rows"]:
     """Return the covariance of distances with the observations: k, then -k' d where normals are observed."""
     return torch.cat([k, *(-(part[:, :near] * first[:, :near]) for part in d)], 1)
 

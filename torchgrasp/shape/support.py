@@ -8,11 +8,13 @@ from torch import Tensor
 
 from torchgrasp.base import Value, join
 from torchgrasp.cloud.prepare import PreparedCloud
-from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, unit
-from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, Kind
+from torchgrasp.geometry.linalg import Points, farthest_points, fibonacci_sphere, unit
+from torchgrasp.shape.completion.complete import LEAST_NOISE, PART, Completion, Kind, correlated_errors
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, Silhouette
+from torchgrasp.shape.completion.vessel import FORM_ERROR, RIM, HiddenWall, Vessel, Wall, complete_walls, lid
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.values import Normalisation, Observations, off_surface, on_surface
+from torchgrasp.values import PointCloud
 
 OUTER_POINTS, OUTER_RADIUS = 20, 1.2
 """Number of points outside, and the radius, normalised, of the sphere on which they lie (Sec. 3.1)."""
@@ -35,6 +37,8 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
 
 Part = tuple[Observations, Tensor | None]
 """Observations, and the errors that their distances share."""
+FreeSpace = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
+"""Normalised points in free space, and least signed distances there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Support(Value):
         normal_noise: standard deviation of the cloud's normals.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
         parts: observed points of the outline and of the hidden side.
-        free: points in free space and least signed distances there, normalised; None: not used.
+        free: points in free space; None: not used.
         rows: mask of the cloud's points that lie on this surface; None: all points.
         kind: see `ShapeGP`.
     """
@@ -57,7 +61,7 @@ class Support(Value):
     normal_noise: float
     std_factor: float = 1.0
     parts: tuple[Part, ...] = ()
-    free: tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]] | None = None
+    free: FreeSpace | None = None
     rows: Bool[Tensor, "rows"] | None = None
     kind: Kind = "guess"
 
@@ -115,18 +119,89 @@ def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[P
     return (rim, None), (hidden, completion.deviations.to(frame.center) / frame.scale)
 
 
-def observe(
-    frame: Normalisation, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], noise: float, normal_noise: float
-) -> Observations:
+def observe(frame: Normalisation, points: Points, normals: Points, noise: float, normal_noise: float) -> Observations:
     """Return observations of surface points [m] with normals; `noise` [m] is along the normal."""
     x = frame.normalise(points.to(frame.center))
     return on_surface(x, normals.to(x), torch.full_like(x[:, 0], noise / frame.scale), normal_noise)
 
 
-def free_space(
-    outline: Outlines, frame: Normalisation, table: float | None = None
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return points in free space and lower bounds of their signed distance, both normalised.
+@dataclasses.dataclass(frozen=True)
+class Middle(Value):
+    """Points in the middle of a vessel's wall and its thickness, normalised; the wall is thicker unless `side`."""
+
+    x: Points
+    side: Bool[Tensor, "n"]
+    thickness: float
+
+
+def vessel_supports(
+    cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float, noise: float
+) -> tuple[Support, Support, Middle]:
+    """Return observations of a vessel's outer and inner surface besides the seen points, and points amid the wall.
+
+    `noise` is that of an anchor's distance, normalised. Distances of the inner surface are positive around the axis.
+    """
+    device, cloud = cloud.points.device, cloud.to("cpu")
+    frame = frame_around(cloud.points)
+    outer, inner = complete_walls(cloud, vessel, outline, table)
+    hidden = join([outer.hidden, lid(vessel)])
+    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64)])
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    sphere = frame.metres(OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS))
+
+    def anchors(points: Points, distance: Float[Tensor, "n"]) -> Observations:
+        return off_surface(frame.normalise(points), distance / frame.scale, noise)
+
+    surface = torch.cat([cloud.points[outer.seen], hidden.points])
+    middle = (axis + 0.5 * (table + vessel.rim) * up)[None]
+    depth = torch.minimum(torch.cdist(middle, surface).amin(1), middle[:, 2] - table)
+    body = anchors(torch.cat([middle, sphere]), torch.cat([-depth, torch.cdist(sphere, surface).amin(1)]))
+    rim = observe(frame, outline.rim, outline.rim_normals, RIM_NOISE, 2 * HIDDEN_NORMAL_NOISE)
+
+    surface = torch.cat([cloud.points[inner.seen], inner.hidden.points])
+    bottom = float(surface[:, 2].min())
+    over = vessel.rim + 0.5 * vessel.radius  # there the inner surface still surrounds free space: it has no lid
+    inside = axis + torch.tensor([0.5 * (bottom + vessel.rim), vessel.rim, over]).double()[:, None] * up
+    around = sphere[sphere[:, 2] < vessel.rim]
+    clear = torch.cat([torch.cdist(inside, surface).amin(1), -torch.cdist(around, surface).amin(1)])
+    space = anchors(torch.cat([inside, around]), clear)
+
+    def support(anchors: Observations, parts: list[Part], free: FreeSpace | None, rows: Tensor) -> Support:
+        on_device = tuple((part.to(device), None if errors is None else errors.to(device)) for part, errors in parts)
+        placed, factor = (frame.to(device), anchors.to(device), NORMAL_NOISE), STD_FACTORS["vessel", True]
+        return Support(*placed, factor, on_device, free, rows.to(device), "vessel")
+
+    free = free_space(outline, frame.to(device), table)
+    return (
+        support(body, [(rim, None), _observe_hidden(frame, hidden)], free, outer.seen),
+        support(space, [_observe_hidden(frame, inner.hidden)], None, inner.seen),
+        _middle(cloud, vessel, (outer, inner), frame).to(device),
+    )
+
+
+def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: Normalisation) -> Middle:
+    """Return points half a thickness behind both walls, without handles and rim."""
+    assert cloud.normals is not None
+    points, normals = [], []
+    for wall, seen in zip(walls, (vessel.body & ~vessel.inner, vessel.inner), strict=True):
+        points += [cloud.points[seen], wall.hidden.points]
+        normals += [cloud.normals[seen], wall.hidden.normals]
+    at, out = torch.cat(points), torch.cat(normals)
+    below = at[:, 2] < vessel.rim - RIM
+    at, out = at[below], out[below]
+    rows = farthest_points(at, 150, tie=TIE)
+    x = frame.normalise(at[rows] - 0.5 * vessel.thickness * out[rows])
+    return Middle(x, out[rows, 2].abs() < 0.8, vessel.thickness / frame.scale)  # a floor may be thicker
+
+
+def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
+    """Return observations of a wall's hidden points, and their correlated errors."""
+    errors = correlated_errors(wall.points, wall.shared, FORM_ERROR)
+    return observe(frame, wall.points, wall.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE), errors / frame.scale
+
+
+def free_space(outline: Outlines, frame: Normalisation, table: float | None = None) -> FreeSpace:
+    """Return points in free space, and lower bounds of their signed distance.
 
     The points lie beside the object's outline, and below the table. A bound becomes an observation only where the shape
     violates it: otherwise the shape would inflate to its visual hull.

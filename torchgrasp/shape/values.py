@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgrasp.base import Batch, Value
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,11 +43,9 @@ class Observations(Batch):
 
     The noises are standard deviations.
 
-    >>> some, outward = torch.ones(3), torch.eye(3)
-    >>> oriented = torch.tensor([False, True, True])
-    >>> seen = Observations(outward, 0 * some, outward, oriented, 0.01 * some, 0.05 * some)
-    >>> len(seen.rows()[0]), seen.with_normals_first().has_normal
-    (9, tensor([ True,  True, False]))
+    >>> x, some = torch.eye(3), torch.ones(3)
+    >>> len(Observations(x, 0 * some, x, some > 0, 0.01 * some, 0.05 * some).rows()[0])
+    12
     """
 
     x: Float[Tensor, "n 3"]
@@ -73,9 +71,7 @@ class Observations(Batch):
         return self[torch.argsort(~self.has_normal, stable=True)]
 
 
-def on_surface(
-    x: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normal_noise: float
-) -> Observations:
+def on_surface(x: Points, normals: Points, noise: Float[Tensor, "n"], normal_noise: float) -> Observations:
     """Return observations of points on the surface (distance 0) with their normals."""
     yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
     return Observations(x, torch.zeros_like(noise), normals, yes, noise, torch.full_like(noise, normal_noise))
@@ -142,11 +138,10 @@ def surface_deviation(variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b
     return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)
 
 
-def pass_gradients(
-    x: Float[Tensor, "*b 3"],
-    evaluate: Callable[[Tensor], tuple[Tensor, ...]],
-    differentiate: Callable[[Tensor], tuple[Tensor, ...]],
-) -> tuple[Tensor, ...]:
+Evaluate = Callable[[Tensor], tuple[Tensor, ...]]
+
+
+def pass_gradients(x: Float[Tensor, "*b 3"], evaluate: Evaluate, differentiate: Evaluate) -> tuple[Tensor, ...]:
     """Return `evaluate(x)`; autograd uses the derivatives (*b, ..., 3) that `differentiate(x)` gives.
 
     Second derivatives raise an error.

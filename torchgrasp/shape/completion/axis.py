@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
-from torchgrasp.geometry.linalg import across, farthest_points, fibonacci_sphere, solve_least_squares, unit
+from torchgrasp.geometry.linalg import Points, across, farthest_points, fibonacci_sphere, solve_least_squares, unit
 from torchgrasp.geometry.plane import LEAST_TILT
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.shape.completion.symmetry import PROBES, SymmetryScorer
@@ -66,7 +66,7 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
     return (axis_from_cloud, Revolution(origin, mask)) if excluded.double().mean() < MAX_FREE else None
 
 
-def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Revolution | None:
+def find_revolution(points: Points, normals: Points) -> Revolution | None:
     """Return the upright body of revolution to which most points belong; None: there is none."""
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
@@ -74,7 +74,7 @@ def find_revolution(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     return None if mask is None else Revolution(center, mask)
 
 
-def fit_axis(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "2"]:
+def fit_axis(points: Points, normals: Points) -> Float[Tensor, "2"]:
     """Return the vertical axis, as a point (2,) [m], that most lines along the normals meet."""
     return _fit_to_lines(points, _lines_from_above(points, normals))
 
@@ -92,7 +92,7 @@ class _Lines(NamedTuple):
     offset: Float[Tensor, "n"]
 
 
-def _lines_from_above(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> _Lines:
+def _lines_from_above(points: Points, normals: Points) -> _Lines:
     """Return the lines along the normals of points, seen from above."""
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     steep = slope > STEEP
@@ -101,7 +101,7 @@ def _lines_from_above(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"
     return _Lines(slope, steep, level, across, (across * points[:, :2]).sum(1))
 
 
-def _fit_to_lines(points: Float[Tensor, "n 3"], lines: _Lines) -> Float[Tensor, "2"]:
+def _fit_to_lines(points: Points, lines: _Lines) -> Float[Tensor, "2"]:
     """Return the point (2,) that most lines meet, by reweighted least squares (Cauchy)."""
     miss, center = torch.zeros_like(lines.offset), points[:, :2].mean(0)
     for _ in range(30):
@@ -112,7 +112,7 @@ def _fit_to_lines(points: Float[Tensor, "n 3"], lines: _Lines) -> Float[Tensor, 
 
 
 def _round_body(
-    points: Float[Tensor, "n 3"], lines: _Lines, center: Float[Tensor, "2"], allowed: Callable[[Tensor, Tensor], Tensor]
+    points: Points, lines: _Lines, center: Float[Tensor, "2"], allowed: Callable[[Tensor, Tensor], Tensor]
 ) -> Bool[Tensor, "n"] | None:
     """Return the mask of a body about a vertical axis; None if it is not round, a small part, or one flat side.
 
@@ -132,9 +132,7 @@ def _round_body(
     return mask if bool((mask.double().mean() > BODY_SHARE) & (spread < 1.0) & (one_way < 0.95)) else None
 
 
-def _fit_axis(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], float]:
+def _fit_axis(points: Points, normals: Points) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], float]:
     """Return a point [m] of the axis that most lines along the normals meet, the axis direction, and the cost."""
     starts = 12  # Gauss-Newton steps with robust weights (Cauchy) from so many directions; each narrows the weights
     direction = fibonacci_sphere(2 * starts)[:starts]

@@ -18,7 +18,13 @@ from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directi
 from torchgrasp.shape.completion.axis import Revolution, find_axis, find_revolution
 from torchgrasp.shape.completion.ellipsoid import find_ellipsoid
 from torchgrasp.shape.completion.silhouette import FRONT_MARGIN, TIE, Outlines
-from torchgrasp.shape.completion.symmetry import SymmetryScorer, find_plane_through_axis, find_planes, planes_near
+from torchgrasp.shape.completion.symmetry import (
+    Mirror,
+    SymmetryScorer,
+    find_plane_through_axis,
+    find_planes,
+    planes_near,
+)
 from torchgrasp.shape.posterior import symmetric_root
 from torchgrasp.values import PointCloud
 
@@ -191,9 +197,7 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
     return images
 
 
-def _mirror_in(
-    scorer: SymmetryScorer, number: int, plane: Float[Tensor, "4"], score: float
-) -> Callable[[_Image], _Image]:
+def _mirror_in(scorer: SymmetryScorer, number: int, plane: Mirror, score: float) -> Callable[[_Image], _Image]:
     """Return the function that mirrors points, or another image, in a plane; planes near it give the errors."""
     steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype)
     near = planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps)

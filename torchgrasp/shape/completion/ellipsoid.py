@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import Points, farthest_points, fibonacci_sphere, unit
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 
 INDEPENDENT, INDEPENDENT_RIM = 60, 8
@@ -43,9 +43,7 @@ class Ellipsoid:
     misfit: float
 
 
-def find_ellipsoid(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], outline: Outlines, table: float | None
-) -> Ellipsoid | None:
+def find_ellipsoid(points: Points, normals: Points, outline: Outlines, table: float | None) -> Ellipsoid | None:
     """Return the ellipsoid, nearly a ball, that fits the whole cloud; None: no such ellipsoid fits.
 
     The body may have a flat foot: the ellipsoid may reach below the table, but not float above it.

@@ -176,19 +176,11 @@ def silhouette(view: PointCloud) -> Silhouette:
     outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
     seen = ~unseen if not unseen.any() else _distance(~unseen) * cell > GROW * spacing
     rim, rim_normals = _rim(outside, seen, corner, cell, pixels, depths)
+    depth = np.where(unseen, 0.0, raster[tuple(nearest)])  # nothing is in front of what is not seen
+    images, gap = (torch.from_numpy(outside), torch.from_numpy(depth)), gap * float(np.median(depths))
     origin, axes = view.viewpoint.double().cpu(), torch.from_numpy(axes)
-    return Silhouette(
-        viewpoint=origin,
-        axes=axes,
-        corner=torch.from_numpy(corner),
-        cell=cell,
-        outside=torch.from_numpy(outside),
-        depth=torch.from_numpy(np.where(unseen, 0.0, raster[tuple(nearest)])),  # nothing there is in front of it
-        rim=torch.from_numpy(rim) @ axes + origin,
-        rim_normals=torch.from_numpy(rim_normals) @ axes,
-        cut=bool(unseen.any()),
-        gap=gap * float(np.median(depths)),
-    )
+    edge = torch.from_numpy(rim) @ axes + origin, torch.from_numpy(rim_normals) @ axes
+    return Silhouette(origin, axes, torch.from_numpy(corner), cell, *images, *edge, bool(unseen.any()), gap)
 
 
 def _beyond_image(

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Batch, Value
-from torchgrasp.geometry.linalg import farthest_points, solve_least_squares, unit
+from torchgrasp.geometry.linalg import Points, farthest_points, solve_least_squares, unit
 from torchgrasp.shape.completion.axis import fit_axis, rotations_about_z
 from torchgrasp.shape.completion.complete import NEW, merge_hidden
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
@@ -45,7 +45,7 @@ class Vessel(Value):
     body: Bool[Tensor, "n"]
 
 
-def find_vessel(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Vessel | None:
+def find_vessel(points: Points, normals: Points) -> Vessel | None:
     """Return the open vessel that a cloud shows; None: the cloud shows no vessel.
 
     Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a cubic polynomial of
@@ -176,9 +176,7 @@ def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float
     return HiddenWall(points, up, shared)
 
 
-def _merge(
-    seen: Float[Tensor, "n 3"], outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float
-) -> HiddenWall:
+def _merge(seen: Points, outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float) -> HiddenWall:
     """Return points of the parts, first parts first, that are new, hidden, below the rim and above height `least`."""
     from scipy.spatial import KDTree
 
