@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".obj", ".off", ".ply", ".stl")  # formats whose memory is bounded by the size of the file
 
-_REFERENCE = re.compile(rb"/\S*")
-"""Normal and texture of a corner in an .obj: a corner with two textures would become two, and open the surface."""
+_REFERENCE = re.compile(rb"/\S*")  # normal and texture of a corner in an .obj: two textures would open the surface
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
 

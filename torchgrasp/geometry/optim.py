@@ -88,7 +88,6 @@ def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int
 
 
 Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
-"""Residuals and their Jacobian."""
 
 
 @dataclasses.dataclass(frozen=True)

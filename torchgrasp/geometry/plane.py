@@ -18,8 +18,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import unit
 
-GRID = 2.0**-20
-"""Spacing [m] of rounded points in an upright frame, a micrometre: far above the rounding errors of a transform."""
+GRID = 2.0**-20  # spacing [m] of rounded points: far above the rounding errors of a transform
 POINTS, DIRECTIONS, POSES = (
     ("points", "viewpoint", "vertices"),
     ("normals", "approach", "witness", "frustum"),
@@ -28,8 +27,7 @@ POINTS, DIRECTIONS, POSES = (
 """Fields of values that change with the frame; all other fields are invariant."""
 
 
-LEAST_TILT = 0.05
-"""Least sine of the angle between the vertical and the direction to the camera at which the camera has an azimuth."""
+LEAST_TILT = 0.05  # least sine of the angle between the vertical and a camera that has an azimuth
 
 
 @checked

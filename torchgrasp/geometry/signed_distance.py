@@ -14,10 +14,8 @@ from torchgrasp.checks import Range, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.mesh import closest_on_triangles
 
-BAND = 0.026
-"""Distance [m] from the surface within which every second node is exact: the reach of a palm's collision spheres."""
-NEAR, INWARD = 3, 5
-"""Spacings from the surface, outside and inside, within which every node is exact; other nodes are interpolated."""
+BAND = 0.026  # distance [m] within which every second node is exact: the reach of a palm's spheres
+NEAR, INWARD = 3, 5  # spacings outside and inside the surface within which every node is exact
 FAR_SHARE = 8  # one of so many samples of the surface is used for nodes beyond the band
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
 

@@ -24,8 +24,7 @@ from torchgrasp.values import Certificate, Contacts, Grasps, IKSeeds
 
 Reachable = Callable[[Tensor], Tensor]
 """Returns which poses obj_from_hand (k, 4, 4) an arm reaches, as booleans (k,)."""
-PAPER_TOLERANCE = 10 * MILLIMETRE
-"""Largest distance [m] of a tip from its contact in the paper's chain, about the radius of a tip."""
+PAPER_TOLERANCE = 10 * MILLIMETRE  # the paper's largest distance [m] of a tip from its contact: about a tip's radius
 TIP_TOLERANCE, TIP_PENETRATION = 1 * MILLIMETRE, 2 * MILLIMETRE
 """Largest distance [m] of a tip from its contact, and largest depth of a tip in the estimated surface."""
 ANGLE_TOLERANCE = math.radians(2)  # largest angle [rad] of a contact direction outside the pad's cone

@@ -18,10 +18,8 @@ from torchgrasp.ik.configuration import Rows, SpatialJacobian
 from torchgrasp.scene.occupancy import Occupancy
 
 MILLIMETRE = 1e-3  # unit [m] of all residuals
-CLEARANCE = 4 * MILLIMETRE
-"""Clearance [m] of links from object and table that refinement aims at; the checks accept any positive clearance."""
-SELF_CLEARANCE = 1 * MILLIMETRE
-"""Clearance [m] between links that refinement aims at; it is smaller, because shapes of links are exact."""
+CLEARANCE = 4 * MILLIMETRE  # clearance [m] of links from object and table that refinement aims at
+SELF_CLEARANCE = 1 * MILLIMETRE  # the same between links, whose shapes are exact
 HINGES = 8  # number of least clearances of each kind that enter one step
 
 

@@ -30,8 +30,7 @@ from torchgrasp.shape.values import SurfaceJet
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 
-CONTACT_WEIGHT = 2.0
-"""Weight of a millimetre of the contact problem: it is larger than 1, because contacts have no margins."""
+CONTACT_WEIGHT = 2.0  # weight of a millimetre of the contact problem: contacts have no margins
 
 
 class Stage(NamedTuple):
@@ -43,7 +42,6 @@ class Stage(NamedTuple):
 
 
 STAGES = (Stage(5, False, 1e5), Stage(6, True, 1e4), Stage(7, True, 500.0), Stage(8, True, 50.0))
-"""Few rows above these costs would end as grasps."""
 
 
 @dataclasses.dataclass(frozen=True)

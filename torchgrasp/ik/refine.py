@@ -14,8 +14,7 @@ from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration, Rows, SpatialJacobian, differentiate
 from torchgrasp.values import Contacts
 
-TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0
-"""Weights of a millimetre at a tip, and of a cosine outside the pad's cone; a millimetre of clearance weighs 1."""
+TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0  # weights of a millimetre at a tip, and of a cosine outside the pad's cone
 HAND_STEP = 0.6  # largest step of a pose or a joint [m or rad]
 ITERATIONS = 30  # most steps of one refinement
 

@@ -24,8 +24,7 @@ from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values import Contacts, IKSeeds
 
 LENGTH_SCALE, COSINE_SCALE = 0.01, 0.5  # distances of tip centres [m] and of pad axes that count the same
-CANDIDATES = 64
-"""Nearest postures of a row, over all assignments, whose clearances are measured; also the most seeds of a row."""
+CANDIDATES = 64  # nearest postures of a row whose clearances are measured; also the most seeds of a row
 ASSIGNMENTS = 6  # assignments of contacts to fingers in which a row is compared with the whole library
 WRONG_SIDE = 0.3  # mean cosine of the outward normals of tips and contacts above which a seed touches from inside
 

@@ -19,8 +19,7 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, Contacts
 
-EXACT = 1e-13
-"""Largest |W phi| of a balance that needs no solver: with full rank, a phi less than 1e-9 away balances exactly."""
+EXACT = 1e-13  # largest |W phi| of a balance that needs no solver: an exact balance is near
 GAP = 1e-9  # largest difference of the two bounds of a proven margin, which must lie twice as far from `MIN_MARGIN`
 MAX_RESIDUAL = 1e-6  # largest |W phi| of a balance found by HiGHS, for wrenches of length about 1
 STRICT = 1e-10  # tolerance of HiGHS, its least. With its default, 1e-7, margins err by 1e-8 and may cross `MIN_MARGIN`.

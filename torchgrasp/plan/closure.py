@@ -24,26 +24,19 @@ from torchgrasp.base import in_chunks
 from torchgrasp.geometry.frames import degenerate, subsets
 from torchgrasp.geometry.linalg import unit
 
-Vectors = Float[Tensor, "b f 3"]
-"""A vector at each of the contacts in every row: points or normals."""
-Guess = Float[Tensor, "b m"] | None
-"""Coefficients of the first wrenches of each cone, for a start."""
+Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
+Guess = Float[Tensor, "b m"] | None  # coefficients of the first wrenches of each cone
 BALANCED = 1e-9  # largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about 1)
-MIN_MARGIN = 1e-6
-"""Least positive coefficient: far above the certificate's errors, far below equal coefficients, 1 / (f e)."""
-MIN_RANK_RATIO = 1e-3
-"""Least singular value of the wrench matrix over its largest. Eq. (13) alone also holds for contacts on a line."""
+MIN_MARGIN = 1e-6  # least positive coefficient: far above the certificate's errors, far below 1 / (f e)
+MIN_RANK_RATIO = 1e-3  # least singular value of the wrenches over the largest: contacts on a line have 0
 PIVOTS = 100  # most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the optimum
 OPTIMAL = 1e-12  # multipliers below this are zero: the objective grows no further
 ARTIFICIAL_GAIN = 1e3  # added to the gain of the artificial rows, far above any multiplier: they leave first
 BLOCKING = 1e-11  # a bound approached more slowly than this, for each unit of the step, is parallel to it
 GRASPS_PER_CHUNK = 2048  # grasps at a time: their tableaux stay in the cache
-PARALLEL = 1e-9
-"""Planar wrenches (of length about 1) with a shorter cross product are parallel: above rounding in float64."""
+PARALLEL = 1e-9  # planar wrenches (of length about 1) with a shorter cross product are parallel
 FIRST_EDGES = 4  # edges of a cone in the first programme
-ROUNDS = 12
-"""Most programmes: twenty random grasps of four contacts close at friction 2e-7 too great at most, relatively; after
-eight programmes it is 4e-5."""
+ROUNDS = 12  # most programmes: more make hardly a verdict sharper
 
 
 def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:

@@ -18,6 +18,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.certify import check_contacts, check_unit
 from torchgrasp.plan.closure import Vectors, closed_exact, first_balance, tangents
+from torchgrasp.plan.problem import walls_at
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import combined_covariance, symmetric_root
 from torchgrasp.shape.values import surface_deviation
@@ -26,8 +27,7 @@ from torchgrasp.threads import single_threaded
 from torchgrasp.values import Contacts
 
 FOOTPRINT = 0.012  # half the width [m] over which a fingertip senses the slope of the surface: the radius of its sphere
-NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
-"""Nodes of a line, in standard deviations of the surface at its contact: three err by 0.07, five by 0.02 at most."""
+NODES = (4.0, 1.5, 0.0, -1.5, -4.0)  # nodes of a line, in standard deviations of the surface at its contact
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
 """Outer half of the grid, in the same unit; it holds all nodes."""
 
@@ -82,12 +82,11 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     normals = check_unit(contacts.normals.detach().double().to(shape.device))
     if not bool(well_inside(shape, contacts).all()):
         raise BadArgument("contacts.points", "a contact at the edge of the domain", "contacts further inside")
-    owner = shape.wall_at(points.flatten(0, 1)).unflatten(0, points.shape[:2])
-    deviation, distance, slope, covariance = _along_lines(shape.walls[0], shape.std_factor, points, normals)
-    if len(shape.walls) > 1:  # a finger meets the wall of its contact; errors of different walls are independent
-        covariance = covariance * _on_same(owner[..., 0])
-    for number, wall in enumerate(shape.walls[1:], start=1):
-        parts, own = _along_lines(wall, shape.std_factor, points, normals), owner[..., number]
+    (wall, own), *others = walls_at(shape, points)
+    deviation, distance, slope, covariance = _along_lines(wall, shape.std_factor, points, normals)
+    covariance = covariance * _on_same(own)  # errors of different walls are independent
+    for wall, own in others:  # a finger meets the wall of its contact
+        parts = _along_lines(wall, shape.std_factor, points, normals)
         deviation = torch.where(own, parts[0], deviation)
         distance = torch.where(own[..., None], parts[1], distance)
         slope = torch.where(own[..., None, None], parts[2], slope)

@@ -22,7 +22,7 @@ from torchgrasp.plan.closure import (
     tangents,
     wrenches,
 )
-from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, walls_of
+from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, walls_at
 from torchgrasp.plan.solver import project
 from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import ContactSpec
@@ -40,25 +40,17 @@ def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, 
 def normal_variation(
     shape: Shape, points: Vectors, normals: Vectors, radius: float, among: Bool[Tensor, "b f"] | None = None
 ) -> Float[Tensor, "b f"]:
-    """Return the largest angle [rad] between the normal at a contact and the normals on a ring of a `radius` [m].
+    """Return the largest angle [rad] between a contact's normal and those on a ring of `radius` [m] on its wall.
 
-    On a thin wall all points of the ring are taken on the contact's side. Contacts outside the mask `among` have
-    infinite angles.
+    Contacts outside the mask `among` have infinite angles.
     """
     variation = torch.full_like(points[..., 0], math.inf)
     among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
     ring = points[:, :, None] + radius / float(shape.scale) * ring_directions(normals, points, JUDGED_POINTS)
-    walls = walls_of(shape)
-    for number, wall in enumerate(walls):
-        own = among if len(walls) == 1 else among & _owned(shape, points, number)
+    for wall, own in walls_at(shape, points):
+        own = own & among
         variation[own] = _wall_variation(wall, ring[own], normals[own])
     return variation
-
-
-def _owned(shape: Shape, points: Vectors, number: int) -> Bool[Tensor, "b f"]:
-    """Return which contacts are on the wall of a given number."""
-    owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009 a shape of one wall need not tell
-    return owner[:, number].unflatten(0, points.shape[:2])
 
 
 def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
@@ -91,14 +83,12 @@ def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: 
 
     The values are lengths, chords times the ring's radius in normalised units; `radius` is in m.
     """
-    found, *others = (_wall_constraint(wall, points, flatness, radius) for wall in walls_of(shape))
-    for number, other in enumerate(others, start=1):
-        own = _owned(shape, points, number)[:, None].expand(-1, GUIDING_POINTS, -1).flatten(1)
-        value, slope = (
-            torch.where(own, other.value, found.value),
-            torch.where(own[..., None], other.by_points, found.by_points),
-        )
-        found = FlatnessConstraint(value, slope, points)
+    (first, _), *others = walls_at(shape, points)
+    found = _wall_constraint(first, points, flatness, radius)
+    for wall, own in others:
+        other, own = _wall_constraint(wall, points, flatness, radius), own.repeat(1, GUIDING_POINTS)
+        slope = torch.where(own[..., None], other.by_points, found.by_points)
+        found = FlatnessConstraint(torch.where(own, other.value, found.value), slope, points)
     return found
 
 
@@ -123,8 +113,7 @@ def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: flo
     return FlatnessConstraint(value, by_points, points)
 
 
-ON_SURFACE = 1e-6
-"""Largest |f_d| of a contact on the surface, normalised: 0.1 um on a hand-sized object, far above rounding."""
+ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far above rounding
 
 
 def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> ContactPlan:

@@ -33,8 +33,7 @@ DIRECTIONS, NEIGHBOURS, REFINEMENTS, SHRINK = 1024, 128, 12, 0.55
 EVENNESS = 0.01  # weight of the ratio of the largest to the least normal force, against the tangent needed
 PREFERENCE = 0.2  # weight of the distance from the preferred proportions, against the tangent needed
 SLACK = 0.04  # tangent that four or five contacts may need beyond the least one, so that their forces are more even
-STEPS, KEPT = 30, 0.3
-"""Newton steps, and the share of tau's distance from the needed ratio that remains after each step."""
+STEPS, KEPT = 30, 0.3  # Newton steps, and the share of tau's distance from the needed ratio that each step leaves
 MAX_FRICTION = 10.0  # tangent of the widest friction cones in which forces are sought
 Push = Float[Tensor, "b f k"]
 Slide = Float[Tensor, "b f 3 k"]

@@ -12,10 +12,10 @@ for each cone is left. Every inequality is a bound <= 0.
 import dataclasses
 import functools
 import math
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch, map_tensors
@@ -25,10 +25,8 @@ from torchgrasp.shape.values import MeanJet, SurfaceJet
 from torchgrasp.specs import ContactSpec
 
 INSIDE = 0.99  # inequalities are solved to this share of their bound: the last steps onto the surface stay inside it
-CONE_MARGIN = 0.02
-"""The cosine between force and inward normal exceeds that of the cone by this much: strictly inside, as phi > 0."""
-LEAST_SIDE = 0.05
-"""Least distance of two tip centres, normalised: coincident ones balance, but their wrenches lack rank."""
+CONE_MARGIN = 0.02  # the cosine between force and inward normal exceeds that of the cone by this much
+LEAST_SIDE = 0.05  # least distance of two tip centres, normalised: wrenches of coincident tips lack rank
 
 
 @runtime_checkable
@@ -53,14 +51,26 @@ class Shape(Protocol):
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
 
 
+AnyShape = TypeVar("AnyShape", bound=Shape)
+
+
 def device_of(shape: Shape) -> torch.device:
     """Return the device of a shape; the CPU if it has none."""
     return getattr(shape, "device", torch.device("cpu"))
 
 
-def walls_of(shape: Shape) -> tuple[Shape, ...]:
+def walls_of(shape: AnyShape) -> tuple[AnyShape, ...]:
     """Return the surfaces of a shape, each as a shape: two for an open vessel, else the shape itself."""
     return getattr(shape, "walls", (shape,))
+
+
+def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tensor, "b f"]]]:
+    """Return each surface of a shape with the mask of the contacts that are on it."""
+    walls = walls_of(shape)
+    if len(walls) == 1:
+        return [(walls[0], torch.ones(points.shape[:2], dtype=torch.bool, device=points.device))]
+    owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009 a shape of one wall need not have it
+    return list(zip(walls, owner.unflatten(0, points.shape[:2]).unbind(-1), strict=True))
 
 
 def triple_jet(shape: Shape, points: Vectors) -> SurfaceJet:
@@ -128,8 +138,7 @@ def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> tupl
     return pull_signs(points.shape[1], points.device).to(points) @ (tension[..., None] * sides), sides
 
 
-Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]
-"""Values that should not be positive, and their Jacobian."""
+Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]  # values that should be <= 0, with Jacobian
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,8 +26,7 @@ from torchgrasp.plan.problem import (
 )
 from torchgrasp.shape.surface import newton_step
 
-LONGEST_STEP = 0.3
-"""A point moves at most this far in a step (normalised): about the range in which the surface is smooth."""
+LONGEST_STEP = 0.3  # a point moves at most this far in a step (normalised): there the surface is smooth
 TENSION_DAMPING = 0.1  # damping of the tensions relative to that of the points: tensions may change faster
 SURFACE = 10.0  # weight of the surface: a step off it would be undone by the projection, which the cones then resist
 BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cones in the last stage

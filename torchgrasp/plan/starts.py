@@ -16,19 +16,12 @@ from torchgrasp.plan.problem import ContactProblem, Shape, device_of, walls_of
 from torchgrasp.plan.solver import project
 from torchgrasp.specs import FLAT_RADII, ContactSpec
 
-CANDIDATE_TRIPLES = 350
-"""Triples of surface points among which candidates are found: 1050 points are 6 mm apart on a hand-sized object. Of
-eight objects of the families on which constants are chosen, 300 starts gave 1076 executable grasps; with 700, 1027."""
-CANDIDATE_FLATNESS = 0.9
-"""Share of the largest normal variation that a candidate may have: its ring turns with the triple it joins."""
-FAR = 0.1
-"""A start with a point farther than this from the surface (normalised signed distance) is no guess of contacts."""
+CANDIDATE_TRIPLES = 350  # triples of surface points among which candidates are found
+CANDIDATE_FLATNESS = 0.9  # share of the largest normal variation that a candidate may have
+FAR = 0.1  # a start farther than this from the surface (normalised) is no guess of contacts
 NEAR_CENTRE = 0.1  # normalised distance from the centre to which such a start is drawn in: the paper's radius of starts
-DRAWN_PER_START, ROUNDS = 20, 8
-"""Rows drawn for each start in one round, and most rounds: 2 to 10 % of the candidates' triples are closed."""
-ENOUGH_CLOSED, SURVEYED = 0.1, 250
-"""Share of starts, and of how many, that are closed from the draw on where contacts can be as flat as is asked: the
-hand then gets a hundred triples of a thousand starts."""
+DRAWN_PER_START, ROUNDS = 20, 8  # rows drawn for each start in one round, and most rounds: few rows are closed
+ENOUGH_CLOSED, SURVEYED = 0.1, 250  # share of starts, and of how many, that must be closed: contacts can be so flat
 STARTS_PER_CHUNK = 500  # starts planned at once: memory is bounded, and a plan from fewer starts begins one from more
 
 

@@ -32,7 +32,6 @@ META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 
 
 Chunk = Annotated[int, Range(0, 1_000_000)]
-"""The number of a chunk."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,8 +18,7 @@ from torchgrasp.posture_model.em import Components, Progress, Shard, expectation
 from torchgrasp.posture_model.mixture import CODE_NAMES, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 
-MAX_REGULARISATION = 1e-6
-"""Largest variance added to a dimension, relative to the data's: scikit-learn's default, which is absolute there."""
+MAX_REGULARISATION = 1e-6  # largest variance added to a dimension, relative to the data's
 TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes some hundred
 
 

@@ -23,10 +23,8 @@ from torchgrasp.values import ContactCode, Contacts
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
 """The six assignments of three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
 CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")  # the numbers of a code q = (L, N): three lengths [m], three cosines
-PAPER_ENERGY = 2.0
-"""The paper's threshold on f_i of Eq. (21). It accepts 32 % of the codes of a single component (chi-square_6 < 4)."""
-DEFAULT_ENERGY = 6.295793622
-"""Half the 95 % quantile of chi-square_6: in `bench.py hand --only reach` it accepts 95 % of planned grasps or more."""
+PAPER_ENERGY = 2.0  # the paper's threshold on f_i of Eq. (21)
+DEFAULT_ENERGY = 6.295793622  # half the 95 % quantile of chi-square with six degrees of freedom
 
 
 def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b q"]:

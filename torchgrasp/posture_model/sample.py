@@ -24,8 +24,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
 from torchgrasp.specs import ContactSpec
 
-ROLL = math.radians(25)
-"""Deviation [rad] of either tilt of a contact direction: of 1904 planned grasps half are tilted by more than 30."""
+ROLL = math.radians(25)  # deviation [rad] of either tilt of a contact direction from the pad's axis
 BALANCES = 200  # directions in the three-dimensional space of internal forces that are tried: 0.25 rad apart
 
 
@@ -72,8 +71,7 @@ def _close_triples(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3
     return closed.any(1)
 
 
-CHUNK_POSTURES = 10_000
-"""Free postures from one generator. It is no argument, because another number gives a seed other postures."""
+CHUNK_POSTURES = 10_000  # free postures from one generator; another number gives a seed other postures
 BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for the same reason
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
 

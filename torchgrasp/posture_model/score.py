@@ -15,8 +15,7 @@ from torchgrasp.posture_model.fit import fit_mixture
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 
-COMPARED_MODES = 4
-"""Modes of which the nearest is compared with the conditional mean: a code has a few postures at most."""
+COMPARED_MODES = 4  # modes of which the nearest is compared: a code has a few postures at most
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,11 +18,9 @@ from torchgrasp.checks import LEAST, Positive, Range, checked
 Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise and three times differentiable where r > 0, with k'(0) = 0."""
 KernelName = Literal["thin_plate", "matern52", "rbf"]
-Orders = Annotated[int, Range(1, 4)]
-"""How many of k and its derivatives."""
+Orders = Annotated[int, Range(1, 4)]  # how many of k and its derivatives
 
-NEAR_ZERO = 1e-5
-"""Below this distance k'(r) / r is taken as k''(r / 2), which avoids 0 / 0 and is exact for the thin plate."""
+NEAR_ZERO = 1e-5  # below it k'(r) / r is taken as k''(r / 2), which avoids 0 / 0
 
 
 @checked

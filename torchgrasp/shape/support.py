@@ -16,8 +16,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.values import Normalisation, Observations, off_surface, on_surface
 from torchgrasp.values import PointCloud
 
-OUTER_POINTS, OUTER_RADIUS = 20, 1.2
-"""Number of points outside, and the radius, normalised, of the sphere on which they lie (Sec. 3.1)."""
+OUTER_POINTS, OUTER_RADIUS = 20, 1.2  # number of points outside, and normalised radius of their sphere (Sec. 3.1)
 OUTER_NOISE = 0.3  # standard deviation, normalised, of a distance outside: the nearest of sparse points is too far away
 NORMAL_NOISE, RIM_NORMAL_NOISE, HIDDEN_NORMAL_NOISE = 0.05, 0.5, 0.25
 """Standard deviations of normals: of a seen one, of one on the outline, and of one on the hidden side."""
@@ -35,8 +34,7 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
 
 `scripts/train.py bands DIR` fits them."""
 
-Part = tuple[Observations, Tensor | None]
-"""Observations, and the errors that their distances share."""
+Part = tuple[Observations, Tensor | None]  # observations, and the errors that their distances share
 FreeSpace = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 """Normalised points in free space, and least signed distances there."""
 

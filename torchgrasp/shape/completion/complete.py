@@ -30,18 +30,14 @@ from torchgrasp.values import PointCloud
 
 NEW, SPACING = 0.006, 0.004  # least distance [m] of a hidden point from the cloud and from another hidden point
 LEAST_NOISE = 0.003  # standard deviation [m] of a mirrored point of an object that is symmetric about that very plane
-SYMMETRIC, ASYMMETRY = 0.45, 0.060
-"""Score from which on an object counts as symmetric, and its asymmetry [m] for each 1 of score that is missing."""
+SYMMETRIC, ASYMMETRY = 0.45, 0.060  # score of a symmetric object, and asymmetry [m] for each 1 of score below
 PART = 0.02  # length scale [m] of the asymmetry: a part without a mirror image is missing as a whole
 TEMPERATURE = 0.1  # a plane's probability is proportional to exp(score / temperature)
-NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045
-"""Planes compared with a plane for its uncertainty: steps of each axis, greatest angle [rad] and shift over the
-cloud's size."""
+NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045  # planes near a plane: steps of an axis, angle [rad], shift / size
 
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
 """What a hidden side follows from: an ellipsoid, an axis, mirror planes, or nothing but the outline."""
-SomeHidden = TypeVar("SomeHidden", bound=Any)
-"""A batch with `points` [m]."""
+SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 
 
 @dataclasses.dataclass(frozen=True)

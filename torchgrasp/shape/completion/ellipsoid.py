@@ -15,15 +15,12 @@ from torch import Tensor
 from torchgrasp.geometry.linalg import Points, farthest_points, fibonacci_sphere, unit
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 
-INDEPENDENT, INDEPENDENT_RIM = 60, 8
-"""Points of the cloud and of the outline that count as independent: neighbours are correlated."""
+INDEPENDENT, INDEPENDENT_RIM = 60, 8  # points of the cloud and the outline that count as independent
 POINT_NOISE, SLOPE_NOISE, RIM_NOISE, TABLE_NOISE = 0.001, 0.15, 0.002, 0.001
 """Standard deviations of a point [m], of its normal, of the outline [m] and of the table [m]."""
 ELONGATION = 0.03  # standard deviation of the logarithm of an axis over the mean axis
-MAX_MISFIT, MAX_RELATIVE_MISFIT = 0.00165, 0.052
-"""Greatest RMS distance of the cloud from the ellipsoid, in metres and in mean radii."""
-FORWARD = float(np.sqrt(np.finfo(float).eps))
-"""The same while it is fitted, over a parameter or 1, whichever is more: half the digits."""
+MAX_MISFIT, MAX_RELATIVE_MISFIT = 0.00165, 0.052  # greatest RMS distance of the cloud, in metres and in mean radii
+FORWARD = float(np.sqrt(np.finfo(float).eps))  # step of the finite differences, over a parameter or 1
 UPPER = np.triu_indices(3)  # entries of a symmetric matrix that are parameters
 
 

@@ -14,12 +14,10 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, farthest_points, unit
 from torchgrasp.values import PointCloud
 
-GROW, SHRINK = 2.0, 1.65
-"""The outline is the union of discs about the pixels, then shrunk; both in spacings of the pixels."""
+GROW, SHRINK = 2.0, 1.65  # the outline is a union of discs about the pixels, then shrunk [pixel spacings]
 FRONT_MARGIN = 0.002  # a point may be this far [m] in front of the visible surface: noise of the camera
 MAX_BEHIND = 0.2  # greatest share of points behind others in a single view
-TIE = 2e-9
-"""Relative difference of squared distances that rounding can make: the frame must not decide between equal ones."""
+TIE = 2e-9  # relative difference of squared distances by rounding: the frame must not decide
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,13 +22,10 @@ if TYPE_CHECKING:
 MATCH_DISTANCE = 0.003  # distance [m] over which a mirrored point stops matching the cloud
 PROBES = 150  # points of the cloud that score a plane
 OFFSETS, FINE_OFFSETS = 17, 65  # offsets tried for each direction of a plane, and for a known direction
-MIN_FACING, FACING = 0.35, 0.7
-"""Cosine of a plane's normal with the view below which the plane hides no points, and above which it is frontal."""
-RIM_PRIOR = 0.15
-"""Loss of score at a quarter of the cloud's size from the rim, without a table: a view ends near the mirror plane."""
+MIN_FACING, FACING = 0.35, 0.7  # cosines of a plane's normal with the view: hides points above, is frontal above
+RIM_PRIOR = 0.15  # loss of score at a quarter of the size from the rim: a view ends near the mirror plane
 WITHIN = 0.12  # greatest loss of score against the best plane
-APART = math.cos(math.radians(25.0))
-"""Cosine of the least angle between two planes: closer ones mirror to the same points."""
+APART = math.cos(math.radians(25.0))  # closer planes mirror to the same points
 MAX_VIOLATION = 0.15  # greatest mean violation of free space, in [0, 1], of a plane added for the points that it hides
 SLOPE = 0.15  # a plane near the best one is dropped if its score is less by this: it matches only because it is near
 AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.4

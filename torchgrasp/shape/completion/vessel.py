@@ -15,13 +15,10 @@ from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.values import PointCloud
 
 LEVEL = 0.5  # least length of the horizontal part of a wall's normals: others are of rim, floor and noise
-BODY_SHARE, INNER_SHARE, OUTER_SHARE = 0.65, 0.09, 0.07
-"""Least share of the walls' points on the body, and of the cloud on the inner and on the outer wall."""
-USUAL, SPREAD, THICKNESS_ERROR = 0.0035, 0.0015, 0.0012
-"""Usual thickness [m] of household vessels, its standard deviation, and the standard deviation of one fit."""
+BODY_SHARE, INNER_SHARE, OUTER_SHARE = 0.65, 0.09, 0.07  # least shares: of the walls on the body, of either wall
+USUAL, SPREAD, THICKNESS_ERROR = 0.0035, 0.0015, 0.0012  # usual thickness [m], its deviation, and that of a fit
 RIM = 0.003  # points so near [m] below the rim belong to no wall: their normals depend on both walls
-CENTER_ERROR, FORM_ERROR, FLOOR_ERROR = 0.0006, 0.001, 0.003
-"""Standard deviations [m] of the axis, of real walls about a surface of revolution, and of an unseen floor."""
+CENTER_ERROR, FORM_ERROR, FLOOR_ERROR = 0.0006, 0.001, 0.003  # deviations [m] of axis, form and unseen floor
 
 
 @dataclasses.dataclass(frozen=True)
