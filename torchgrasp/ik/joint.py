@@ -178,7 +178,7 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
     >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), torch.zeros(3))
+    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), torch.zeros(3).double())
     >>> seeds = nearest_postures(PostureLibrary.of(hand, 1000), grasp.contacts, problem.world)
     >>> solve_joint(problem, seeds, fit_shape(load_object("jug").view), ContactSpec()).status
     tensor([0])
