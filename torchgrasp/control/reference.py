@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -30,6 +30,7 @@ from torchgrasp.control.law import (
     position_gain,
     surface_covariance,
 )
+from torchgrasp.control.paper.stability import StabilityModel
 from torchgrasp.control.tactile import Observation
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
@@ -38,9 +39,6 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values import Grasps
-
-if TYPE_CHECKING:
-    from torchgrasp.control.paper.stability import StabilityModel
 
 
 @checked
@@ -93,7 +91,7 @@ class ClosingReference(Value):
         grasp: Grasps,
         force: Annotated[float, Range(0.01, 100.0)] = 4.0,
         kp: Positive | None = None,
-        stability: "StabilityModel | None" = None,
+        stability: StabilityModel | None = None,
     ) -> "ClosingReference":
         """Derive the closing plan of one grasp, on the CPU.
 
@@ -217,7 +215,7 @@ def closing_gains(
     grasp: Grasps,
     hand: Hand,
     force: Annotated[float, Range(0.01, 100.0)] = 4.0,
-    stability: "StabilityModel | None" = None,
+    stability: StabilityModel | None = None,
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
 
