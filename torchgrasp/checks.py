@@ -70,11 +70,7 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
 
     NumPy numbers become Python numbers. The fields of an argument that is a value are checked again. In a method,
     letters in shapes have the sizes of the value's fields. A value without `__post_init__` that the library itself
-    makes from tensors is not checked.
-
-    Args:
-        thing: a function, a method, or a dataclass.
-        gradients: whether tensors may require a gradient.
+    makes from tensors is not checked. Only with `gradients` may tensors require a gradient.
 
     Raises:
         BadArgument: when called: an argument of another type, shape, dtype or range, or a number that is not finite.

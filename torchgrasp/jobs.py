@@ -34,11 +34,8 @@ def run_tasks(
     Each task runs on one thread of a separate process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task
     whose process dies twice gives `Status.WORKER_DIED`. All workers end when the caller stops iterating.
 
-    Args:
-        function: a function of a module, so that a worker can import it.
-        tasks: arguments of the calls: paths, numbers and arrays, but no tensors, because processes would share them.
-        workers: number of processes; 0: this process, without a time limit.
-        limit: wall time of a task [s].
+    A worker imports the module of the function. Tasks hold no tensors, because processes would share them. Without
+    workers the tasks run in this process, without a time `limit` [s].
 
     Raises:
         BadArgument: workers outside [0, 1024], or a limit below 1 ms.

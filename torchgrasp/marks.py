@@ -35,22 +35,14 @@ ANY, FINITE = "any number, NaN and infinity too", "finite numbers in every field
 RIGID = "a rigid transform: a right-handed rotation, and the row 0 0 0 1"
 """The mark of transforms: a matrix that scales or mirrors would give wrong results without an error."""
 LEAST, MOST = sys.float_info.min, sys.float_info.max  # least positive and largest finite number
-Seed = Annotated[int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")]
-"""A seed of random draws."""
-Count = Annotated[int, Range(1, 1_000_000)]
-"""A number of objects that are kept in memory."""
-Positive = Annotated[float, Range(LEAST, MOST, "a positive number")]
-"""A number above zero."""
-Fraction = Annotated[float, Range(0.0, 1.0)]
-"""A share or a probability."""
-Measured = Annotated[float, ANY]
-"""A number that is NaN if nothing was measured."""
-Pose = Annotated[Float[Tensor, "4 4"], RIGID]
-"""A rigid transform."""
-Poses = Annotated[Float[Tensor, "g 4 4"], RIGID]
-"""A rigid transform for each row."""
-Length = Annotated[float, Range(0.0, 10.0)]
-"""A length [m] within reach."""
+Seed = Annotated[int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")]  # a seed of random draws
+Count = Annotated[int, Range(1, 1_000_000)]  # a number of objects that are kept in memory
+Positive = Annotated[float, Range(LEAST, MOST, "a positive number")]  # a number above zero
+Fraction = Annotated[float, Range(0.0, 1.0)]  # a share or a probability
+Measured = Annotated[float, ANY]  # a number that is NaN if nothing was measured
+Pose = Annotated[Float[Tensor, "4 4"], RIGID]  # a rigid transform
+Poses = Annotated[Float[Tensor, "g 4 4"], RIGID]  # a rigid transform for each row
+Length = Annotated[float, Range(0.0, 10.0)]  # a length [m] within reach
 DTYPES = {"Float": (torch.float32, torch.float64), "Int": (torch.int64, torch.int32), "Bool": (torch.bool,)}
 """The dtypes that each kind of annotation allows."""
 NUMBERS = {int: Range(-(2**63), 2**63 - 1, "a whole number"), float: Range(-MOST, MOST, "a finite number")}

@@ -12,25 +12,8 @@ from torchgrasp.cloud.read import CloudFile, cloud_from_array, read_cloud, read_
 from torchgrasp.cloud.sensor import SensorNoise, median_depth
 
 __all__ = [
-    "Advice",
-    "CloudFile",
-    "CloudReport",
-    "NormalCheck",
-    "SensorNoise",
-    "check_cloud",
-    "cloud_from_array",
-    "cloud_from_depth",
-    "cut_object",
-    "diagnose_cloud",
-    "estimate_normals",
-    "format_report",
-    "look_at",
-    "median_depth",
-    "merge_clouds",
-    "partial_view",
-    "read_cloud",
-    "read_cloud_file",
-    "remove_outliers",
-    "save_cloud",
+    "Advice", "CloudFile", "CloudReport", "NormalCheck", "SensorNoise", "check_cloud", "cloud_from_array",
+    "cloud_from_depth", "cut_object", "diagnose_cloud", "estimate_normals", "format_report", "look_at",
+    "median_depth", "merge_clouds", "partial_view", "read_cloud", "read_cloud_file", "remove_outliers", "save_cloud",
     "voxel_downsample",
-]
+]  # fmt: skip

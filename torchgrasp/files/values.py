@@ -180,14 +180,9 @@ def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ..
 
 def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: dict[str, Any]) -> SomeValue:
     """Return a value built from tensors by dotted name; a missing tensor becomes None."""
-    values: dict[str, Any] = dict(rest)
-    own = _tensor_fields(of)
-    for name, hint in _hints(of).items():
-        if _is_value(hint):
-            values[name] = _build(hint, tensors, f"{prefix}{name}.", {})
-        elif name in own and name not in rest:
-            values[name] = tensors.get(prefix + name)
-    return of(**values)
+    values = {name: tensors.get(prefix + name) for name in _tensor_fields(of) if "." not in name} | rest
+    nested = {name: hint for name, hint in _hints(of).items() if _is_value(hint)}
+    return of(**values, **{name: _build(hint, tensors, f"{prefix}{name}.", {}) for name, hint in nested.items()})
 
 
 def _hints(of: type[Value]) -> dict[str, Any]:

@@ -46,8 +46,7 @@ class Finger(NamedTuple):
     pad: Pad
 
 
-Grasping = tuple[Finger, ...]
-"""The grasping fingers, three to five, in grasp order."""
+Grasping = tuple[Finger, ...]  # the grasping fingers, three to five, in grasp order
 
 Fingers = str | int | tuple[str, ...]
 """The grasping fingers: an option of hand.toml, a number of fingers, or names, also as "index,middle,thumb"."""

@@ -15,10 +15,8 @@ from torchgrasp.checks import Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.kinematics import map_points
 
-Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]
-"""Largest separation [m] that is needed exactly."""
-Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
-"""Axes and centres of shapes in the palm's frame."""
+Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]  # largest separation [m] that is needed exactly
+Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]  # axes and centres of shapes in the palm's frame
 Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]]
 """Function of pairs: the directions in which second shapes leave the first, and points on which the pushes act."""
 

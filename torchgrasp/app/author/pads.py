@@ -27,8 +27,7 @@ SHORT_ARM = 1e-3  # a joint whose axis passes a tip nearer than this [m] does no
 BESIDE = 0.003  # distance [m] from a ray or a plane within which points of a surface count
 
 Vector = Float[np.ndarray, "3"]
-Points = Float[np.ndarray, "_ 3"]
-"""Points, of any count in each use."""
+Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 
 
 class Guess(NamedTuple):
