@@ -119,3 +119,17 @@ def test_bad_arguments_are_named(seen):
         fit_support(seen[0], torch.full((3,), torch.inf))
     with pytest.raises(NoSupport, match="7 points"):
         fit_support(seen[0][:7])
+
+
+def test_a_plane_that_objects_go_through_is_no_support():
+    pose = look_at(20.0, 40.0, 0.8)
+    blocks = [box((0.16, 0.2, 0.1), (0.0, y)) for y in (-0.14, 0.14)]
+    tall = box((0.05, 0.05, 0.16))  # between the blocks, higher than their tops
+    with pytest.raises(NoSupport):
+        find_supports(*look([*blocks, tall], None, pose))
+    for meshes, table, height in (
+        ([*blocks, tall], 0.0, 0.0),
+        ([*blocks, box((0.05, 0.05, 0.06), (0, 0.14, 0.13))], None, 0.1),
+    ):
+        plane = fit_support(*look(meshes, table, pose))
+        assert abs(plane.offset - height) < 0.003 and float(plane.normal[2]) > 0.999

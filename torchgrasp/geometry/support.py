@@ -16,6 +16,7 @@ from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.plane_fit import LEAST_SHARE, MOST_TILT, REACH, ROUGH, PlaneFit, View, assume_noise, fit_planes
 
 MOST_THROUGH = 0.1  # greatest number of points seen through a support's region, over the number on it
+MOST_PIERCED = 0.05  # greatest share of the low points over a support that continue below it
 LEAST_STANDING = 0.001  # least share of the points that stand low on a support, over its region
 LEAST_WIDTH, FURNITURE = 0.14, 0.3
 """Least width [m] of a support's region; a wider face than FURNITURE [m] belongs to no object that a hand grasps."""
@@ -142,10 +143,7 @@ def bound(
     """
     if int(on.sum()) < 3:
         return None
-    normal, middle = plane.normal.to(points), points[on].mean(0)
-    side = points[on][0] - middle
-    x = unit(side - (side @ normal) * normal)
-    axes = torch.stack([x, torch.linalg.cross(normal, x)], -1)
+    middle, axes = points[on].mean(0), _axes(plane.normal.to(points), points[on])
     crossing, behind = cross(plane, points, eye)
     flat, lower = (((p - middle) @ axes) for p in (points[on], crossing[behind & ~on]))
     region = None
@@ -157,6 +155,13 @@ def bound(
         return None
     outward = region.sides[:, :2] @ axes.T
     return Support(plane, torch.cat([outward, (region.sides[:, 2] - outward @ middle)[:, None]], -1), region.width)
+
+
+def _axes(normal: Float[Tensor, "3"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 2"]:
+    """Return two unit vectors across a normal, which turn with the points."""
+    side = points[0] - points.mean(0)
+    x = unit(side - (side @ normal) * normal)
+    return torch.stack([x, torch.linalg.cross(normal, x)], -1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,13 +247,8 @@ class _Candidate:
 def _ordered(found: list[_Candidate]) -> list[_Candidate]:
     """Return the candidates, the most plausible first."""
     first = max(found, key=lambda candidate: candidate.score)
-    higher = [
-        candidate
-        for candidate in found
-        if candidate.parallel(first)
-        and candidate.support.width > FURNITURE
-        and float(first.support.plane.height(candidate.middle)) > 0
-    ]
+    furniture = [candidate for candidate in found if candidate.support.width > FURNITURE and candidate.parallel(first)]
+    higher = [candidate for candidate in furniture if float(first.support.plane.height(candidate.middle)) > 0]
     first = max(higher, key=lambda candidate: candidate.score, default=first)
     return [first, *sorted((c for c in found if c is not first), key=lambda candidate: -candidate.score)]
 
@@ -280,6 +280,11 @@ def _judge(view: View, fit: PlaneFit, least_width: float) -> _Candidate | str:
     # Low points of an object are over the plane's own region. A pan's rim is not over its floor.
     over = (height > tolerance) & (height < REACH) & support.covers(points, -inner)
     low, standing = int(((height > tolerance) & (height < LOW)).sum()), int((over & (height < LOW)).sum())
+    cells = torch.floor(points @ _axes(fit.normal, points) / 0.02).long().unique(dim=0, return_inverse=True)[1]
+    above, below = ((sign * height > tolerance) & (sign * height < LOW) for sign in (1, -1))
+    pierced = torch.bincount(cells, below.double()) > 0.2 * torch.bincount(cells, (above & over).double())
+    if int((pierced[cells] & above & over).sum()) > max(LEAST_STANDING * len(points), MOST_PIERCED * standing):
+        return f"a plane with {share:.0%} of the points, but objects go through it"
     steep = view.eye is not None and float(unit(view.eye - middle) @ fit.normal) > 0.9  # it hides the feet of objects
     if (int(over.sum()) if steep else standing) < max(LEAST_STANDING * len(points), 0.05 * low):
         return f"a plane with {share:.0%} of the points and nothing that stands on it"
