@@ -17,8 +17,10 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, to_upright
 from torchgrasp.geometry.support import find_table
+from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
+from torchgrasp.scene.merge import find_touching
 from torchgrasp.values import PointCloud
 
 
@@ -208,11 +210,20 @@ class Scene(Value):
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Problems of the picture, a sentence each: several supports, a target at the border of the image."""
+        """Problems of the picture, a sentence each: several supports, objects that touch, a target that is cut off."""
         found = [
             f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
             for plane in self.others
         ]
+        labels = torch.zeros(self.image.depth.shape, dtype=torch.long)
+        labels[self.pixels[:, 0], self.pixels[:, 1]] = self.labels
+        for a, b in find_touching(self.image, labels):
+            found.append(f"objects {a} and {b} touch, and their border is a guess: give a mask of the one to grasp")
+        parts = cut_creases(self.image, labels)
+        for k in self.things:
+            sizes = parts[labels == k].unique(return_counts=True)[1]
+            if int((sizes > 0.1 * sizes.sum()).sum()) > 1:
+                found.append(f"object {k} has a crease: if it is several objects, give a mask of the one to grasp")
         if self.image.at_border(self.pixels[self.rows_of()]):
             found.append(
                 "the target is cut off at the border of the image: its other part is unknown; turn the camera to it"

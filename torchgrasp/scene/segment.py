@@ -1,30 +1,21 @@
-"""The objects in a depth image: what rises above the table, divided where the depth jumps, and merged again.
-
-Pieces of one object touch, are over each other's footprint, make one hollow body's rim, or float beside it.
-"""
-
-import itertools
-from typing import Any
+"""The objects in a depth image: what rises above the table, cut at jumps and creases, and merged to objects."""
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchgrasp.cloud.sensor import fit_noise
-from torchgrasp.geometry.frames import inverse, rotate
-from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import Hull, Support
+from torchgrasp.geometry.support import Support
+from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage, label_radii
+from torchgrasp.scene.merge import REACH, merge_pieces
 
 BAND = 0.010  # heights [m] below this, of either sign, measure the noise of the table
 LEAST_HEIGHT = 0.002  # least height [m] of an object's pixels above the table
 NEAR = 0.005  # distance [m] within which a pixel at a depth jump belongs to an object
 FEW = 6  # pieces with fewer pixels are noise
-GAP, TOUCH, FAR = 0.008, 3, 0.05
-"""Pieces touch where TOUCH pixels are within GAP [m]; parts of one object are within FAR [m]."""
-NESTED = 0.4  # a body with this share of its points over the footprint of a larger one is a part of it
 OVERHANG = 0.05  # distance [m] to which an object extends beyond the visible region of its support
 VAST = 0.2  # greatest root mean square distance [m] of an object's points from their middle; a wall has more
 
@@ -32,8 +23,8 @@ VAST = 0.2  # greatest root mean square distance [m] of an object's points from 
 def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     """Return the label of each pixel: 0 for the table, flying pixels and nothing; 1, 2, ... for objects by size.
 
-    An object is a connected component of the pixels above the table, in which depth has no jump. Pixels at jumps go to
-    the object whose surface they lie on, if there is one.
+    A piece is a connected component of the pixels above the table, without a jump of depth and without a crease. Pieces
+    of one object are merged. Pixels at jumps go to the object whose surface they lie on, if there is one.
 
     Args:
         image: one view of the scene.
@@ -49,17 +40,20 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     thin = _components(risen & (pieces == 0), smooth.depth, jump)
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
-    # A tenth of an object's pixels are 3.5 mm high and four deviations of the noise; an uneven table is not.
+    # A tenth of an object's pixels are 5 mm high and four deviations of the noise; an uneven table is not.
     flat, whole = measured & (mean.abs() < BAND), count_labels(pieces)
     noise = fit_noise(image.depth[flat], mean[flat]).sigma(image.depth)
-    high = count_labels(torch.where(mean > (4 * noise).clamp_min(0.0035), pieces, 0), len(whole)) >= 0.1 * whole
+    high = count_labels(torch.where(mean > (4 * noise).clamp_min(0.005), pieces, 0), len(whole)) >= 0.1 * whole
     few = count_labels(torch.where(sure, pieces, 0), len(high)) < FEW
     over = pieces[pieces > 0][support.covers(points[pieces > 0])]
     beside = count_labels(over, len(high)) < 0.2 * whole
     vast = label_radii(points, pieces) > VAST
-    pieces = torch.where((few | ~high | beside | vast)[pieces], 0, pieces)
-    group = _merge(smooth, torch.where(sure, pieces, 0), table, jump)
-    return _numbered(_filled(group[pieces], measured, table.height(points)))
+    pieces = cut_creases(smooth, torch.where((few | ~high | beside | vast)[pieces], 0, pieces))
+    group = merge_pieces(smooth, torch.where(sure, pieces, 0), table, jump)
+    whole = _numbered(_filled(group[pieces], measured, table.height(points)))
+    small = torch.nonzero(count_labels(whole) < 500 * whole.numel() / (640 * 480))[:, 0].tolist()
+    noisy = [k for k in small if k > 0 and _is_noise(whole, k, image, mean / noise)]
+    return _numbered(torch.where(torch.isin(whole, torch.tensor(noisy, dtype=whole.dtype)), 0, whole))
 
 
 def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
@@ -173,116 +167,25 @@ def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
     return new[labels]
 
 
-def _merge(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
-    """Return the number of the object of each piece, 0 for the piece 0 and for pieces of no object."""
-    from scipy.spatial import KDTree
+def _is_noise(labels: Int[Tensor, "h w"], k: int, image: DepthImage, deviations: Tensor) -> bool:
+    """Return whether a small object is an uneven place of the table, or a fringe of a body ten times as large.
 
-    new = torch.zeros(int(pieces.max()) + 1, dtype=torch.long)
-    names, count = pieces[pieces > 0].unique(return_counts=True)
-    if not len(names):
-        return new
-    order = torch.argsort(pieces[pieces > 0], stable=True)
-    parts = _over_table(image, table)[pieces > 0][order].split(count.tolist())
-    floating = _floating(image, pieces, table, jump)[names].tolist()
-    gap = _gaps([KDTree(part.numpy()) for part in parts])
-    large = [k for k in range(len(parts)) if len(parts[k]) >= 30]
-    bodies = _joined([_Body((k,), parts[k], len(parts[k])) for k in large], gap, floating)
-    for number, body in enumerate(bodies, start=1):
-        new[names[list(body.rows)]] = number
-    for k in range(len(parts)):  # smaller pieces go to the nearest large one
-        if large and k not in large and gap[k, large].min() < GAP:
-            new[names[k]] = new[names[large[int(gap[k, large].argmin())]]]
-    return new
+    Args:
+        labels: of the objects.
+        k: label of the small object.
+        image: of the objects.
+        deviations: heights above the table over the deviation of the noise, with shape (h, w).
+    """
+    from scipy.ndimage import binary_dilation, distance_transform_edt
 
-
-def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> list["_Body"]:
-    """Return the bodies after joining those that are parts of one object, given the gaps [m] between pieces."""
-
-    def between(a: _Body, b: _Body) -> float:
-        return float(gap[np.ix_(a.rows, b.rows)].min())
-
-    done: list[_Body] = []
-    while bodies:
-        body = bodies.pop()
-        parts = [other for other in bodies + done if _one_body(body, other, between(body, other))][:1]
-        bodies, done = ([other for other in some if other not in parts] for some in (bodies, done))
-        (bodies if parts else done).append(sum(parts, body))
-    for body in [body for body in done if all(floating[row] for row in body.rows)]:  # the roots of a handle are hidden
-        others = [other for other in done if other is not body]
-        nearest = min(others, key=lambda other: between(body, other), default=body)
-        reach = FAR if body.size < 0.7 * nearest.size else GAP
-        if body in done and nearest is not body and between(body, nearest) < reach:
-            done = [other for other in others if other is not nearest] + [body + nearest]
-    return done
-
-
-def _over_table(image: DepthImage, table: Plane) -> Float[Tensor, "h w 3"]:
-    """Return the points of all pixels in a frame whose z is the height above the table."""
-    axes, points = torch.stack(across(table.normal.double()), -1), image.points()
-    return torch.cat([points @ axes, table.height(points)[..., None]], -1)
-
-
-def _gaps(trees: list[Any]) -> np.ndarray:
-    """Return the distance [m] within which `TOUCH` points of one tree are near the other; infinity beyond `FAR`."""
-    low, high = np.stack([tree.mins for tree in trees]), np.stack([tree.maxes for tree in trees])
-    gap = np.full((len(trees), len(trees)), np.inf)
-    for a, b in itertools.combinations(range(len(trees)), 2):
-        small, large = sorted((a, b), key=lambda k: trees[k].n)
-        rows = ((trees[small].data > low[large] - FAR) & (trees[small].data < high[large] + FAR)).all(-1)
-        if rows.sum() >= TOUCH:
-            distance = trees[large].query(trees[small].data[rows], distance_upper_bound=FAR)[0]
-            gap[a, b] = gap[b, a] = np.partition(distance, TOUCH - 1)[TOUCH - 1]
-    return gap
-
-
-class _Body:
-    """Pieces of one object: their numbers, how many points they have, some points, and the hull of their footprint."""
-
-    def __init__(self, rows: tuple[int, ...], points: Float[Tensor, "n 3"], count: int) -> None:
-        self.rows, self.count, self.points = rows, count, points[:: 1 + len(points) // 2000]
-        self.hull = Hull.of(points[:, :2])
-        self.top = float(self.points[:, 2].quantile(0.98))
-
-    def __add__(self, other: "_Body") -> "_Body":
-        return _Body(self.rows + other.rows, torch.cat([self.points, other.points]), self.count + other.count)
-
-    @property
-    def size(self) -> float:
-        """The longest side [m] of the box about the points."""
-        return float((self.points.amax(0) - self.points.amin(0)).max())
-
-
-def _one_body(a: _Body, b: _Body, gap: float) -> bool:
-    """Return whether two bodies touch, one is over the footprint of the other, or both are parts of one rim."""
-    if gap < GAP or gap > FAR:
-        return gap < GAP
-    small, large = (a, b) if a.count < b.count else (b, a)
-    if float(large.hull.holds(small.points[:, :2]).double().mean()) > NESTED:
+    mine = labels == k
+    if float((deviations[mine] > 8).double().mean()) < 0.25:
         return True
-    hull = Hull.of(torch.cat([a.hull.corners, b.hull.corners]))
-    if abs(a.top - b.top) > 0.005 or gap > 0.4 * hull.width:  # two heights, or a wide gap in the rim
+    rows, columns = (slice(max(0, int(side.min()) - 4), int(side.max()) + 5) for side in torch.nonzero(mine).T)
+    mine, near, points = mine[rows, columns], labels[rows, columns], image.points()[rows, columns]
+    pixel = image.depth[labels == k].median() / image.intrinsics[0, 0]
+    if float(distance_transform_edt(mine.numpy()).max()) * float(pixel) > 0.005:
         return False
-    both = torch.cat([a.points, b.points])
-    high = both[both[:, 2] > max(a.top, b.top) - 0.004, :2]  # only a hollow body has no top in its middle
-    return float(hull.holds(high, -0.012).double().mean()) < 0.05
-
-
-def _floating(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
-    """Return which pieces float: the table is seen below most of their lower edge, and that edge is high."""
-    floating = torch.zeros(int(pieces.max()) + 1, dtype=torch.bool)
-    down = -rotate(inverse(image.obj_from_camera), table.normal.double()[None])[0, :2]
-    if float(torch.linalg.vector_norm(down)) < 0.2:  # seen from above, no edge is the lower one
-        return floating
-    column, row = torch.round(4 * unit(down)).long().tolist()
-    below, depth_below = (torch.roll(x, (-row, -column), (0, 1)) for x in (pieces, image.depth))
-    edge = (pieces > 0) & (below != pieces) & (depth_below > 0)
-    hidden = edge & (below > 0) & (depth_below < image.depth - jump)
-    free = edge & (below == 0)
-    height = table.height(image.points())
-    for k in pieces[free].unique().tolist():
-        mine = free & (pieces == k)
-        count = int(mine.sum())
-        if count >= TOUCH and count >= 0.7 * (count + int((hidden & (pieces == k)).sum())):
-            low, top = float(height[mine].quantile(0.1)), float(height[pieces == k].quantile(0.9))
-            floating[k] = low > max(0.006, 0.4 * top)
-    return floating
+    around = torch.from_numpy(binary_dilation(mine.numpy(), iterations=4)) & (near > 0) & ~mine
+    around &= count_labels(labels)[near] > 10 * int(mine.sum())
+    return bool(around.any()) and float(torch.cdist(points[around], points[mine]).min()) < REACH

@@ -1,0 +1,125 @@
+"""The convex parts of a connected surface: it is cut along creases, where two surfaces meet at a concave angle."""
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from torchgrasp.scene.image import DepthImage
+
+REACH = 0.012  # distance [m] on either side of a crease over which its angle is measured
+
+
+def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
+    """Return pieces cut along their concave creases into parts, numbered anew; the part 0 is the piece 0.
+
+    Args:
+        image: of the pieces.
+        pieces: number of the piece of each pixel, 0 for none.
+    """
+    from scipy.ndimage import find_objects
+
+    least = 300 * pieces.numel() / (640 * 480)  # pixels of the smallest part
+    points = np.einsum("ij,hwj->hwi", image.obj_from_camera[:3, :3].T.numpy(), image.points().numpy())
+    points -= image.obj_from_camera[:3, :3].T.numpy() @ image.obj_from_camera[:3, 3].numpy()  # in the camera's frame
+    parts, last = pieces.clone(), int(pieces.max())
+    names, count = pieces[pieces > 0].unique(return_counts=True)
+    numbers = torch.zeros(last + 1, dtype=torch.int32)
+    numbers[names[count >= 2 * least]] = torch.arange(1, 1 + int((count >= 2 * least).sum()), dtype=torch.int32)
+    found = numbers[pieces].numpy()
+    boxes: list[tuple[slice, slice]] = find_objects(found)
+    for number, box in enumerate(boxes, start=1):
+        mask = found[box] == number
+        scale = float(image.intrinsics[0, 0]) / float(image.depth[box][torch.from_numpy(mask)].median())
+        own = _join_parts(_divide(points[box], mask, scale * REACH, least), points[box])
+        new = torch.from_numpy(own.astype(np.int64))
+        parts[box] = torch.where(new > 1, last + new - 1, parts[box])
+        last += max(0, int(own.max()) - 1)
+    return parts
+
+
+def _divide(points: np.ndarray, mask: np.ndarray, reach: float, least: float) -> np.ndarray:
+    """Return the parts 1, 2, ... of a piece between its creases; other pixels of it go to the nearest part."""
+    from scipy.ndimage import binary_erosion, distance_transform_edt, label, uniform_filter
+
+    step = max(2, round(reach))
+    inside = (slice(step, -step), slice(step, -step))
+    mask, points = np.pad(mask, step), np.pad(points, ((step, step), (step, step), (0, 0)))
+    share = np.maximum(uniform_filter(mask.astype(float), step | 1), 1e-9)
+    smooth = [uniform_filter(np.where(mask, points[..., k], 0.0), step | 1) / share for k in range(3)]
+    smooth = np.stack(smooth, -1)
+    normal, known = _normals(smooth, mask, max(1, step // 2))
+    crease = np.zeros_like(mask)
+    for down, right in ((1.0, 0.0), (0.0, 1.0), (0.7, 0.7), (0.7, -0.7)):
+        shift = (round(step * down), round(step * right))
+        before, after = (-shift[0], -shift[1]), shift
+        chord = np.roll(smooth, before, (0, 1)) - np.roll(smooth, after, (0, 1))
+        length = np.linalg.norm(chord, axis=-1) + 1e-12
+        first = (np.roll(normal, after, (0, 1)) * chord).sum(-1) / length
+        second = -(np.roll(normal, before, (0, 1)) * chord).sum(-1) / length
+        ends = np.roll(known, after, (0, 1)) & np.roll(known, before, (0, 1))
+        crease |= ends & (np.minimum(first, second) > 0.35) & (length < 4 * REACH)
+    number, count = label(binary_erosion(mask & ~crease, iterations=max(1, step // 3)))
+    large = np.bincount(number.ravel(), minlength=count + 1) >= least
+    large[0] = False
+    names = np.where(large, np.cumsum(large), 0)[number]
+    if large.sum() < 2:
+        return mask[inside].astype(np.int64)
+    nearest = distance_transform_edt(names == 0, return_distances=False, return_indices=True)
+    return np.where(mask, names[tuple(nearest)], 0)[inside]
+
+
+def _normals(points: np.ndarray, mask: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normals towards the camera at (0, 0, 0), and where the pixels about a pixel give one."""
+    known, sides = mask.copy(), []
+    for axis in (1, 0):
+        sides.append(np.roll(points, -step, axis) - np.roll(points, step, axis))
+        known &= np.roll(mask, -step, axis) & np.roll(mask, step, axis)
+    normal = np.cross(*sides)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
+    return np.where((normal * points).sum(-1, keepdims=True) > 0, -normal, normal), known
+
+
+def _join_parts(parts: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return parts joined where the surfaces beside their border meet at no concave angle, numbered from 1."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count = int(parts.max())
+    joined = [(a, b) for a, b in _borders(parts) if not _is_concave(parts, points, a, b)]
+    pairs = np.array(joined, dtype=np.int64).reshape(-1, 2) - 1
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(count, count))
+    names = np.concatenate([[0], connected_components(graph, directed=False)[1] + 1])
+    return names[parts]
+
+
+def _borders(parts: np.ndarray) -> list[tuple[int, int]]:
+    """Return the pairs of parts with a common border of at least 5 pixels."""
+    found = []
+    for one, other in ((parts[1:], parts[:-1]), (parts[:, 1:], parts[:, :-1])):
+        differ = (one != other) & (one > 0) & (other > 0)
+        found.append(np.sort(np.stack([one[differ], other[differ]], -1), -1))
+    pairs, count = np.unique(np.concatenate(found), axis=0, return_counts=True)
+    return [(int(a), int(b)) for a, b in pairs[count >= 5]]
+
+
+def _is_concave(parts: np.ndarray, points: np.ndarray, a: int, b: int) -> bool:
+    """Return whether the surfaces of two parts, measured beside their border, meet at a concave angle."""
+    from scipy.ndimage import binary_dilation
+    from scipy.spatial import KDTree
+
+    first, second = parts == a, parts == b
+    border = KDTree(points[first & binary_dilation(second)])
+    sides = []
+    for side in (points[first], points[second]):
+        distance = border.query(side, distance_upper_bound=0.025)[0]
+        sides.append(side[(distance > 0.004) & np.isfinite(distance)])
+    if min(len(side) for side in sides) < 20:
+        return False
+    middles = [side.mean(0) for side in sides]
+    chord = (middles[1] - middles[0]) / (np.linalg.norm(middles[1] - middles[0]) + 1e-12)
+    rise = []
+    for side, middle, sign in zip(sides, middles, (1.0, -1.0), strict=True):
+        normal = np.linalg.svd(side - middle, full_matrices=False)[2][2]
+        rise.append(sign * float(normal @ chord) * (-1.0 if normal @ middle > 0 else 1.0))
+    return min(rise) > 0.5

@@ -1,0 +1,174 @@
+"""The pieces of a depth image that are one object.
+
+Pieces of one object meet at two ends, as a handle and its cup do; are over each other's footprint; make the rim of one
+hollow body; float beside it; or touch, unless each of them stands on the table or one lies upon the other.
+"""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.geometry.frames import inverse, rotate
+from torchgrasp.geometry.linalg import across, unit
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.support import Hull
+from torchgrasp.scene.image import DepthImage
+
+GAP, TOUCH, FAR = 0.008, 3, 0.05
+"""Pieces touch where TOUCH pixels are within GAP [m]; parts of one object are within FAR [m]."""
+REACH = 0.02  # greatest distance [m] of two pieces that meet at two ends: pixels at rims are missing
+NESTED = 0.4  # a body with this share of its points over the footprint of a larger one is a part of it
+
+
+def merge_pieces(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
+    """Return the number of the object of each piece, 0 for the piece 0 and for pieces of no object."""
+    from scipy.spatial import KDTree
+
+    new = torch.zeros(int(pieces.max()) + 1, dtype=torch.long)
+    names, count = pieces[pieces > 0].unique(return_counts=True)
+    if not len(names):
+        return new
+    order = torch.argsort(pieces[pieces > 0], stable=True)
+    parts = _over_table(image, table)[pieces > 0][order].split(count.tolist())
+    floating = _floating(image, pieces, table, jump)[names].tolist()
+    gap = _gaps([KDTree(part.numpy()) for part in parts])
+    large = [k for k in range(len(parts)) if len(parts[k]) >= 30]
+    bodies = _joined([_Body((k,), parts[k], len(parts[k])) for k in large], gap, floating)
+    for number, body in enumerate(bodies, start=1):
+        new[names[list(body.rows)]] = number
+    for k in range(len(parts)):  # smaller pieces go to the nearest large one
+        if large and k not in large and gap[k, large].min() < GAP:
+            new[names[k]] = new[names[large[int(gap[k, large].argmin())]]]
+    return new
+
+
+def find_touching(image: DepthImage, labels: Int[Tensor, "h w"]) -> list[tuple[int, int]]:
+    """Return the pairs of objects that touch, so that the border between them is a guess."""
+    from scipy.spatial import KDTree
+
+    names, points = labels[labels > 0].unique().tolist(), image.points()
+    gap = _gaps([KDTree(points[labels == k].numpy()) for k in names]) if len(names) > 1 else np.empty((0, 0))
+    return [(names[a], names[b]) for a, b in itertools.combinations(range(len(gap)), 2) if gap[a, b] < 0.5 * GAP]
+
+
+def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> list["_Body"]:
+    """Return the bodies after joining those that are parts of one object, given the gaps [m] between pieces."""
+
+    def between(a: _Body, b: _Body) -> float:
+        return float(gap[np.ix_(a.rows, b.rows)].min())
+
+    done: list[_Body] = []
+    while bodies:
+        body = bodies.pop()
+        parts = [other for other in bodies + done if _one_body(body, other, between(body, other))][:1]
+        bodies, done = ([other for other in some if other not in parts] for some in (bodies, done))
+        (bodies if parts else done).append(sum(parts, body))
+    for body in [body for body in done if all(floating[row] for row in body.rows)]:  # the roots of a handle are hidden
+        others = [other for other in done if other is not body]
+        nearest = min(others, key=lambda other: between(body, other), default=body)
+        reach = FAR if body.size < 0.7 * nearest.size else GAP
+        if body in done and nearest is not body and between(body, nearest) < reach:
+            done = [other for other in others if other is not nearest] + [body + nearest]
+    return done
+
+
+def _over_table(image: DepthImage, table: Plane) -> Float[Tensor, "h w 3"]:
+    """Return the points of all pixels in a frame whose z is the height above the table."""
+    axes, points = torch.stack(across(table.normal.double()), -1), image.points()
+    return torch.cat([points @ axes, table.height(points)[..., None]], -1)
+
+
+def _gaps(trees: list[Any]) -> np.ndarray:
+    """Return the distance [m] within which `TOUCH` points of one tree are near the other; infinity beyond `FAR`."""
+    low, high = np.stack([tree.mins for tree in trees]), np.stack([tree.maxes for tree in trees])
+    gap = np.full((len(trees), len(trees)), np.inf)
+    for a, b in itertools.combinations(range(len(trees)), 2):
+        small, large = sorted((a, b), key=lambda k: trees[k].n)
+        rows = ((trees[small].data > low[large] - FAR) & (trees[small].data < high[large] + FAR)).all(-1)
+        if rows.sum() >= TOUCH:
+            points = trees[small].data[rows]
+            distance = trees[large].query(points, distance_upper_bound=FAR)[0]
+            least = np.partition(distance, TOUCH - 1)[TOUCH - 1]
+            meet = least < REACH and _ends(points[distance < least + 0.01]) > 1
+            gap[a, b] = gap[b, a] = 0.0 if meet else least
+    return gap
+
+
+def _ends(points: np.ndarray) -> int:
+    """Return the number of separate clusters of points: a handle or a rim meets its body at two ends."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(points).query_pairs(0.015, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(len(points), len(points)))
+    return int((np.bincount(connected_components(graph, directed=False)[1]) >= 6).sum())
+
+
+class _Body:
+    """Pieces of one object: their numbers, how many points they have, some points, and the hull of their footprint."""
+
+    def __init__(self, rows: tuple[int, ...], points: Float[Tensor, "n 3"], count: int) -> None:
+        self.rows, self.count, self.points = rows, count, points[:: 1 + len(points) // 2000]
+        self.hull = Hull.of(points[:, :2])
+        self.foot, self.top = self.points[:, 2].quantile(torch.tensor([0.02, 0.98], dtype=points.dtype)).tolist()
+
+    def __add__(self, other: "_Body") -> "_Body":
+        return _Body(self.rows + other.rows, torch.cat([self.points, other.points]), self.count + other.count)
+
+    @property
+    def size(self) -> float:
+        """The longest side [m] of the box about the points."""
+        return float((self.points.amax(0) - self.points.amin(0)).max())
+
+
+def _one_body(a: _Body, b: _Body, gap: float) -> bool:
+    """Return whether two bodies touch, one is over the footprint of the other, or both are parts of one rim."""
+    if gap == 0.0 or gap > FAR:
+        return gap == 0.0
+    small, large = (a, b) if a.count < b.count else (b, a)
+    over = float(large.hull.holds(small.points[:, :2]).double().mean())
+    if not _apart(small, large, over) if gap < GAP else over > NESTED:
+        return True
+    hull = Hull.of(torch.cat([a.hull.corners, b.hull.corners]))
+    if hull.width < 0.025 and min(a.foot, b.foot) > 0.01:  # a standing ring from its edge: none of its parts stands
+        return True
+    if abs(a.top - b.top) > 0.005 or gap > 0.4 * hull.width:  # two heights, or a wide gap in the rim
+        return False
+    both = torch.cat([a.points, b.points])
+    high = both[both[:, 2] > max(a.top, b.top) - 0.004, :2]  # only a hollow body has no top in its middle
+    return float(hull.holds(high, -0.012).double().mean()) < 0.1
+
+
+def _apart(small: _Body, large: _Body, over: float) -> bool:
+    """Return whether two bodies that touch are two objects: side by side on the table, or one upon the other."""
+    if small.count < 0.1 * large.count:
+        return False
+    if over < 0.3:
+        return all(body.foot < max(0.015, 0.5 * body.top) for body in (small, large))
+    return over > 0.5 and small.top > large.top + 0.01 and small.foot > 0.5 * large.top
+
+
+def _floating(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
+    """Return which pieces float: the table is seen below most of their lower edge, and that edge is high."""
+    floating = torch.zeros(int(pieces.max()) + 1, dtype=torch.bool)
+    down = -rotate(inverse(image.obj_from_camera), table.normal.double()[None])[0, :2]
+    if float(torch.linalg.vector_norm(down)) < 0.2:  # seen from above, no edge is the lower one
+        return floating
+    column, row = torch.round(4 * unit(down)).long().tolist()
+    below, depth_below = (torch.roll(x, (-row, -column), (0, 1)) for x in (pieces, image.depth))
+    edge = (pieces > 0) & (below != pieces) & (depth_below > 0)
+    hidden = edge & (below > 0) & (depth_below < image.depth - jump)
+    free = edge & (below == 0)
+    height = table.height(image.points())
+    for k in pieces[free].unique().tolist():
+        mine = free & (pieces == k)
+        count = int(mine.sum())
+        if count >= TOUCH and count >= 0.7 * (count + int((hidden & (pieces == k)).sum())):
+            low, top = float(height[mine].quantile(0.1)), float(height[pieces == k].quantile(0.9))
+            floating[k] = low > max(0.006, 0.4 * top)
+    return floating
