@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 import trimesh
@@ -6,7 +8,9 @@ from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support
+from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage
+from torchgrasp.scene.merge import find_touching
 from torchgrasp.scene.segment import on_surface, segment
 
 TABLE = Plane.horizontal(0.0)
@@ -74,3 +78,58 @@ def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
     inside = (pan.points()[..., :2].norm(dim=-1) < 0.07) & (labels == 1)
     assert (segment(pan, Support(TABLE))[inside & (pan.depth > 0)] == 1).double().mean() > 0.95
     assert (segment(ring, Support(TABLE))[inside & (ring.depth > 0)] == 0).double().mean() > 0.95
+
+
+def torus(major, minor, place, turn=0.0):
+    mesh = trimesh.creation.torus(major, minor)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(torch.pi / 2, [1, 0, 0]))
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
+    return mesh.apply_translation(place)
+
+
+@pytest.mark.parametrize("elevation", [30.0, 55.0])
+@pytest.mark.parametrize("turn", [0.5, 2.0, 3.5])
+def test_a_mug_with_its_handle_and_a_standing_ring_are_one(elevation, turn):
+    handle = torus(0.025, 0.005, [0.04, 0, 0.045]).slice_plane([0.037, 0, 0], [1, 0, 0])
+    mug = trimesh.util.concatenate([cup(), handle])
+    mug.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
+    for meshes in ([mug], [torus(0.05, 0.01, [0, 0, 0.06], turn)]):
+        image, _ = look(meshes, elevation)
+        assert segment(image, Support(TABLE)).max() == 1
+
+
+@pytest.mark.parametrize(
+    "meshes",
+    [
+        [box([0.06, 0.08, 0.12], [-0.031, 0, 0.06]), box([0.06, 0.1, 0.05], [0.03, 0.02, 0.025])],
+        [
+            trimesh.creation.cylinder(0.035, 0.1).apply_translation([0, 0, 0.05]),
+            box([0.1, 0.06, 0.06], [0.02, 0.066, 0.03]),
+        ],
+    ],
+    ids=["boxes", "can and box"],
+)
+def test_objects_that_touch_are_cut_at_the_crease_and_told(meshes):
+    image, labels = look(meshes, 45.0)
+    found = segment(image, Support(TABLE))
+    assert found.max() == 2
+    for k in (1, 2):
+        mine = found[(labels == k) & (found > 0)]
+        assert (mine == mine.mode().values).double().mean() > 0.95
+    assert find_touching(image, found) == [(1, 2)]
+
+
+def test_objects_apart_do_not_touch_and_a_convex_surface_has_no_crease():
+    image, labels = look([box([0.05, 0.05, 0.06], [0, -0.05, 0.03]), box([0.05, 0.05, 0.06], [0, 0.05, 0.03])], 45.0)
+    found = segment(image, Support(TABLE))
+    assert found.max() == 2 and find_touching(image, found) == []
+    assert torch.equal(cut_creases(image, found), found)
+
+
+def test_an_uneven_place_of_the_table_is_no_object():
+    image, _ = look([box([0.05, 0.05, 0.06], [0, 0.1, 0.03])], 45.0)
+    place = image.points()[..., :2]
+    rise = 0.0038 * torch.exp(-((place - torch.tensor([0.0, -0.05])) / 0.02).square().sum(-1))
+    depth = torch.where(image.depth > 0, image.depth - rise / math.sin(math.radians(45.0)), 0.0)
+    found = segment(DepthImage(depth, image.intrinsics, image.obj_from_camera), Support(TABLE))
+    assert found.max() == 1
