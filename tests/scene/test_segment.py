@@ -120,7 +120,7 @@ def test_objects_that_touch_are_cut_at_the_crease_and_told(meshes):
 
 
 def test_objects_apart_do_not_touch_and_a_convex_surface_has_no_crease():
-    image, labels = look([box([0.05, 0.05, 0.06], [0, -0.05, 0.03]), box([0.05, 0.05, 0.06], [0, 0.05, 0.03])], 45.0)
+    image, _ = look([box([0.05, 0.05, 0.06], [0, -0.05, 0.03]), box([0.05, 0.05, 0.06], [0, 0.05, 0.03])], 45.0)
     found = segment(image, Support(TABLE))
     assert found.max() == 2 and find_touching(image, found) == []
     assert torch.equal(cut_creases(image, found), found)

@@ -218,9 +218,11 @@ class Scene(Value):
         labels = torch.zeros(self.image.depth.shape, dtype=torch.long)
         labels[self.pixels[:, 0], self.pixels[:, 1]] = self.labels
         for a, b in find_touching(self.image, labels):
+            if a in self.given and b in self.given:
+                continue
             found.append(f"objects {a} and {b} touch, and their border is a guess: give a mask of the one to grasp")
         parts = cut_creases(self.image, labels)
-        for k in self.things:
+        for k in set(self.things) - set(self.given):
             sizes = parts[labels == k].unique(return_counts=True)[1]
             if int((sizes > 0.1 * sizes.sum()).sum()) > 1:
                 found.append(f"object {k} has a crease: if it is several objects, give a mask of the one to grasp")
