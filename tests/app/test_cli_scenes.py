@@ -137,7 +137,7 @@ def grasp_on(tmp_path, run_command):
 @pytest.mark.parametrize("options", [("--table", "0.001"), ("--up", "0", "0.1", "1")])
 def test_objects_that_the_library_found_are_found_again_on_another_table(seen, tmp_path, planned, grasp_on, options):
     scene = write(tmp_path / "s.npz", seen, 0.03, point=[int(x) for x in middle(seen["labels"], 2)])
-    assert "found again" in grasp_on(*options)
+    assert "objects found again: 1, 2\n" in grasp_on(*options)
     (again,) = planned
     assert again.given == () and again.target == scene.target
     assert set(again.things) == {1, 2} and abs(again.table.offset) < 0.005
@@ -148,7 +148,7 @@ def test_objects_that_the_library_found_are_found_again_on_another_table(seen, t
 def test_beside_a_mask_of_the_user_other_objects_are_found_again(seen, tmp_path, planned, grasp_on):
     scene = write(tmp_path / "s.npz", seen, 0.03, mask=seen["labels"] == 2)
     words = grasp_on("--table", "0.0")
-    assert "objects 1 are as given" in words and "objects 2 are found again" in words
+    assert "objects kept, but for pixels of the table: 1\n" in words and "objects found again: 2\n" in words
     before, after = image_of(scene), image_of(planned[0])
     for label in (1, 2):  # down to the table
         assert (
@@ -164,7 +164,7 @@ def test_what_the_user_gave_only_loses_the_pixels_of_another_table(seen, tmp_pat
     scene = write(tmp_path / "s.npz", seen, -0.03, **{form: own if form == "mask" else 7 * own})
     label = 1 if form == "mask" else 7
     assert scene.given == (label,) and (image_of(scene) == label).sum() > 1.2 * box.sum()  # with a strip of the table
-    assert f"objects {label} are as given" in grasp_on("--table", "0.0")
+    assert f"objects kept, but for pixels of the table: {label}\n" in grasp_on("--table", "0.0")
     (again,) = planned
     assert again.given == (label,) and again.target == (1 if form == "mask" else None)
     assert again.things == (label,)
@@ -180,8 +180,11 @@ def test_a_target_that_is_lost_on_another_table_is_told(seen, tmp_path, planned,
     assert error.startswith("torchgrasp: --table: ") and "object 1, the target, is lost" in error and not planned
     grasp_on("--table", "0.0", "--point", *middle(seen["labels"], 1))
     assert [scene.target in (2, 3) for scene in planned] == [True]
-    write(tmp_path / "s.npz", seen, -0.03, labels=around - binary_dilation(seen["labels"] > 0, iterations=9))
+    beside = 2 * (around - binary_dilation(seen["labels"] > 0, iterations=9))  # a part of the table
+    write(tmp_path / "s.npz", seen, -0.03, labels=beside)
     assert "every object is lost" in grasp_on("--table", "0.0")
+    write(tmp_path / "s.npz", seen, -0.03, labels=np.where(seen["labels"] == 1, 1, beside))
+    assert "objects lost: 2\n" in grasp_on("--table", "0.0")
 
 
 def test_what_the_picture_says_against_a_chosen_object_is_told_before_planning(seen, tmp_path, planned, grasp_on):

@@ -220,9 +220,9 @@ class Grasp(Command):
             lost = f"object {target}, the target," if again.things else "every object"
             wanted = "one that keeps the target, or another target by --label or --point"
             raise BadArgument(name, f"a table ({planes[0].describe()}) with which {lost} is lost", wanted)
-        kept, found = (", ".join(str(k) for k in again.things if (k in scene.given) is own) for own in (True, False))
-        said = [f"objects {kept} are as given, but for pixels of the table"] * bool(kept)
-        print_notes(("; ".join(said + [f"objects {found} are found again on this table"] * bool(found)),))
+        old, new, given = set(scene.things), set(again.things), set(scene.given)
+        said = {"kept, but for pixels of the table": new & given, "found again": new - given, "lost": old - new}
+        print_notes(tuple(f"objects {how}: {str(sorted(some))[1:-1]}" for how, some in said.items() if some))
         return again
 
     def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):
