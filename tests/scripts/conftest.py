@@ -61,6 +61,7 @@ def steps(monkeypatch):
         motion, status = ObjectMotion(1e-6 * (seed % 1000), 0.1), Status.OK if seed % 3 else Status.DROPPED
         return SimpleNamespace(status=status, pushed=motion, slip=motion, contact_order=(1, 0, 2))
 
+    monkeypatch.setattr(trials, "list_objects", lambda: ("cylinder", "jug"))
     monkeypatch.setattr(trials, "fit_shape", lambda cloud, *, support, seed, table: support)
     monkeypatch.setattr(trials, "plan_grasps", plan)
     monkeypatch.setattr(trials, "close_hand", lift)
