@@ -111,27 +111,3 @@ def test_the_same_seed_gives_the_same_grasps_in_other_processes_and_with_two_thr
     assert len(one) > 0 and torch.equal(one.status, two.status)
     torch.testing.assert_close(one.joints, two.joints, rtol=0, atol=1e-6)
     torch.testing.assert_close(one.obj_from_hand, two.obj_from_hand, rtol=0, atol=1e-6)
-
-
-STATE = """
-import random
-import numpy as np
-import torch
-before = torch.get_rng_state(), np.random.get_state()[1].copy(), random.getstate(), torch.get_default_dtype()
-threads = torch.get_num_threads()
-from torchgrasp import load_hand, load_object, plan_grasps
-grasps = plan_grasps(load_object("cylinder").view, load_hand("allegro"), starts=15)
-assert len(grasps) > 0
-assert torch.equal(torch.get_rng_state(), before[0])
-assert np.array_equal(np.random.get_state()[1], before[1])
-assert random.getstate() == before[2]
-assert torch.get_default_dtype() == before[3]
-assert torch.get_num_threads() == threads
-"""
-
-
-@pytest.mark.promise("N10")
-def test_no_global_state_is_touched():
-    """In a process of its own: the annotation checks of the tests draw from Python's global generator themselves."""
-    done = subprocess.run([sys.executable, "-c", STATE], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
