@@ -40,7 +40,6 @@ def start_process(command: list[str], **options: Any) -> subprocess.Popen[str]:
 
 
 def real(values) -> Tensor:
-    """A tensor of float64."""
     return torch.tensor(values, dtype=torch.float64)
 
 

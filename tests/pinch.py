@@ -2,14 +2,12 @@
 
 import dataclasses
 import hashlib
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 import trimesh
 
+from tests.make import run_python
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.geometry.frames import rigid, rotate, rotation_from_vector
 from torchgrasp.hand.load import load_hand
@@ -89,7 +87,6 @@ def digest_elsewhere(name, simulator, seed):
         f"spec = dataclasses.replace(QUICK, simulator={simulator!r}); "
         f"print(digest(close({name!r}, spec=spec, seed={seed})))"
     )
-    root = Path(__file__).parents[1]
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root
-    ).stdout.strip()
+    done = run_python("-c", code)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()

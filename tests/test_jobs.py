@@ -60,8 +60,6 @@ def test_a_task_that_ends_early_waits_for_its_turn_as_an_error_does_and_workers_
     assert [next(results) for _ in range(3)] == [25, 9, 1]
     with pytest.raises(BadArgument, match=r"value: expected .*got 5"):
         next(results)
-    tasks = [("slow", 5), ("square", 3), ("square", 4)]
-    assert [number for number, _ in run_as_they_end(act, tasks, 2, 60.0)][-1] == 0
 
 
 def test_here_a_task_has_one_thread_and_the_caller_its_own():

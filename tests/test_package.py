@@ -5,24 +5,17 @@ import importlib
 import inspect
 import pkgutil
 import re
-import subprocess
-import sys
 import typing
 from pathlib import Path
 
 import pytest
 
 import torchgrasp
+from tests.make import run_python
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "torchgrasp").rglob("*.py"))
 PACKAGES = [found.name for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp.") if found.ispkg]
-
-
-def run(code, folder):
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 SIMULATORS = {"sapien", "mujoco", "coacd", "pebble"}
@@ -39,15 +32,16 @@ SLOW = {"scipy", "trimesh", "yourdfpy", "pytorch_kinematics", "networkx", "lxml"
     ],
     ids=["load_hand", "help"],
 )
-def test_a_start_brings_in_nothing_that_simulates_draws_or_is_slow_to_import(tmp_path, code):
+def test_a_start_brings_in_nothing_that_simulates_draws_or_is_slow_to_import(code):
     """What is heavy is imported by the function that needs it."""
     end = "import sys; print(*(m.split('.')[0] for m in sys.modules))"
-    loaded = set(run(f"{code}\n{end}", tmp_path).splitlines()[-1].split())
+    loaded = set(run_python("-c", f"{code}\n{end}").stdout.splitlines()[-1].split())
     assert "torchgrasp" in loaded
     assert not loaded & (SIMULATORS | DRAWERS | SLOW)
 
 
-def test_import_changes_no_global_state(tmp_path):
+def test_import_changes_no_global_state_and_writes_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     code = """
 import logging, os, random, warnings
 import numpy as np, torch
@@ -63,8 +57,8 @@ for a, b in zip(before, state(), strict=True):
     assert same if isinstance(same, bool) else bool(same.all()), (a, b)
 print("same")
 """
-    assert run(code, tmp_path) == "same\n"
-    assert list(tmp_path.iterdir()) == []
+    found = run_python("-c", code)
+    assert found.stdout == "same\n" and list(tmp_path.iterdir()) == [], found.stderr
 
 
 @pytest.mark.promise("H4")
@@ -82,7 +76,6 @@ def test_source_has_no_neural_network_pickle_or_global_random_state(path):
 
 
 def public_names():
-    """Every public name of the package and of its subpackages, with the object."""
     packages = [torchgrasp, *map(importlib.import_module, PACKAGES)]
     return {f"{p.__name__}.{name}": getattr(p, name) for p in packages for name in getattr(p, "__all__", ())}
 
@@ -139,7 +132,6 @@ PROMISED = set(re.findall(r"^\| ([A-Z]\d+) \| ", PROMISES, re.MULTILINE))
 
 
 def marked() -> set[str]:
-    """Return the ids of promises that tests carry."""
     found = set[str]()
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         for test in ast.parse(path.read_text()).body:

@@ -60,12 +60,9 @@ def test_a_contact_inside_its_tip_is_told(tmp_path, shape, depth):
     """A tip 40 mm long, turned by 90 degrees so that it reaches along z; its end is the pad."""
     turn = "0 1.5707963267948966 0" if "box" in shape else "0 0 0"
     text = (hands_folder() / "allegro" / "hand.urdf").read_text()
-    start = text.index('<link name="index_tip">')
-    end = text.index("</link>", start)
-    link = text[start:end]
-    kept = link[: link.index("<collision>")]
+    start = text.index("<collision>", text.index('<link name="index_tip">'))
     collision = f'<collision><origin xyz="0 0 0" rpy="{turn}"/><geometry>{shape}</geometry></collision>'
-    (tmp_path / "hand.urdf").write_text(text[:start] + kept + collision + text[end:])
+    (tmp_path / "hand.urdf").write_text(text[:start] + collision + text[text.index("</link>", start) :])
     toml = (hands_folder() / "allegro" / "hand.toml").read_text()
     pad = 'contact = [0.01039230485, 0, 0.006]\nnormal = [0.8660254037844387, 0.0, 0.5]\ntip = "sphere"\n'
     pad += "center = [0, 0, 0]\nradius = 0.012"

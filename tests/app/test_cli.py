@@ -24,8 +24,6 @@ MESH = str(DATA / "cylinder" / "mesh.ply")
 
 @pytest.fixture
 def refuse_work(monkeypatch):
-    """Fail the test if the work begins."""
-
     def work(*args, **kwargs):
         raise AssertionError("the work began")
 
@@ -203,11 +201,6 @@ def test_a_misspelt_name_is_answered_with_the_nearest_one(words, near, tmp_path,
     assert refusal(*words).endswith(f"; did you mean {near}?\n")
 
 
-def test_help_lists_every_command_in_a_chapter(run_command):
-    code, out, _ = run_command("--help")
-    assert code == 0 and all(f"\n  {name} " in out for name in cli.COMMANDS) and "Plan grasps" in out
-
-
 def test_an_empty_result_names_what_would_help(tmp_path, run_command):
     options = ["--starts", "5", "--friction", "0", "--table", "0", "--no-report"]
     code, out, _ = run_command("grasp", VIEW, "--hand", "barrett", "--out", tmp_path, *options)
@@ -264,7 +257,10 @@ def test_view_opens_the_page_of_a_folder_or_names_what_is_missing(tmp_path, caps
     assert cli.main(["view", str(tmp_path)]) == 0 and opened == [(tmp_path / "view.html").as_uri()]
 
 
-def test_the_bare_command_shows_where_to_begin(capsys):
+def test_the_bare_command_shows_where_to_begin_and_help_lists_every_command_in_a_chapter(capsys):
+    assert cli.main(["--help"]) == 0
+    said = capsys.readouterr().out
+    assert all(f"\n  {name} " in said for name in cli.COMMANDS) and "Plan grasps" in said
     assert cli.main([]) == 0
     said = capsys.readouterr().out
     shown = [line.strip() for line in said.splitlines() if line.startswith("  torchgrasp")]

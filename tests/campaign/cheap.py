@@ -77,14 +77,12 @@ def cheap_job(number: int, row: JobRow, meta: dict[str, str], pause: float = 0.0
 
 
 def die_at(number: int, row: JobRow, meta: dict[str, str], deadly: int) -> bytes:
-    """Do a job, or die of it."""
     if number == deadly:
         os.kill(os.getpid(), signal.SIGKILL)
     return cheap_job(number, row, meta)
 
 
 def wait_at(number: int, row: JobRow, meta: dict[str, str], patient: int, path: str) -> bytes:
-    """Do a job; one of them waits for a file."""
     while number == patient and not Path(path).exists():
         time.sleep(0.02)
     return cheap_job(number, row, meta)

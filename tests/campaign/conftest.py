@@ -16,7 +16,6 @@ QUICK = CampaignSpec(LIFT, EvaluationSpec(2, "spread", starts=40))
 
 @pytest.fixture(scope="session")
 def carton(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of one object."""
     folder = tmp_path_factory.mktemp("carton")
     (folder / "meshes").mkdir()
     trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "meshes" / "carton.ply")
@@ -26,7 +25,6 @@ def carton(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def data(carton: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The data set of that box."""
     pytest.importorskip("sapien")
     out = tmp_path_factory.mktemp("data")
     run_campaign(carton, load_hand("barrett"), out, QUICK)

@@ -23,7 +23,6 @@ JOBS = 21
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The data set, made in one go."""
     folder = tmp_path_factory.mktemp("whole")
     asked = campaign(JOBS)
     carry_out(asked, folder, work_on(asked, 0))

@@ -40,20 +40,16 @@ def test_a_loader_makes_batches_of_what_the_job_holds(data: Path):
     (batch,) = torch.utils.data.DataLoader(data, batch_size=2)
     grasps = data.job(0).grasps
     assert batch["points"].shape == (2, 300, 3) and batch["points"].dtype == torch.float32
-    assert torch.equal(batch["joints"], grasps.joints.float()) and torch.equal(
-        batch["contacts"], grasps.contacts.points.float()
-    )
+    assert torch.equal(batch["joints"], grasps.joints.float())
+    assert torch.equal(batch["contacts"], grasps.contacts.points.float())
     again = certify(grasps.contacts, ContactSpec(friction=0.6))
-    assert torch.allclose(batch["margin"].double(), again.margin, atol=1e-6) and torch.equal(
-        batch["closed"], again.closed
-    )
+    assert torch.allclose(batch["margin"].double(), again.margin, atol=1e-6)
+    assert torch.equal(batch["closed"], again.closed)
     cloud = {tuple(p) for p in data.job(0).cloud.points.float().tolist()}
     assert all(tuple(p) in cloud for p in batch["points"][1].tolist())
-    assert torch.equal(batch["points"][0], data[0]["points"]) and not torch.equal(
-        batch["points"][0], batch["points"][1]
-    )
-    few = dataclasses.replace(data, points=5000)[0]["points"]
-    assert few.shape == (5000, 3)
+    assert torch.equal(batch["points"][0], data[0]["points"])
+    assert not torch.equal(batch["points"][0], batch["points"][1])
+    assert dataclasses.replace(data, points=5000)[0]["points"].shape == (5000, 3)
     with pytest.raises(IndexError):
         data[2]
 

@@ -32,7 +32,6 @@ class SerialPool:
 
 @pytest.fixture
 def device(monkeypatch):
-    """The pretended device."""
     monkeypatch.setattr("torchgrasp.posture_model.sample.ThreadPoolExecutor", SerialPool)
     with pretend():
         yield
@@ -46,7 +45,6 @@ def sent(value: Any) -> Any:
 
 
 def tensors_of(value: Any) -> list[Tensor]:
-    """Return every tensor of a result."""
     if isinstance(value, Tensor):
         return [value]
     if isinstance(value, Value):

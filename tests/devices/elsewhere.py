@@ -37,7 +37,6 @@ def _home(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a tensor as one of the CPU, whatever it says."""
     return value.as_subclass(Tensor) if isinstance(value, Elsewhere) else value
 
 
@@ -54,7 +53,6 @@ def _moved(value: Any) -> Any:
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:
-    """Yield all tensors of arguments."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, list | tuple):
@@ -65,7 +63,6 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 
 
 def _device(value: Tensor) -> torch.device:
-    """Return where a tensor says it is."""
     return DEVICE if isinstance(value, Elsewhere) else torch.device("cpu")
 
 

@@ -1,16 +1,22 @@
-"""The whole chain on another device: streams, lists, other fingers, reasons, scenes, and the files that it writes."""
+"""The whole chain on another device: plans, reasons, scenes, fields, solvers, vessels, and the files that it writes."""
 
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 
 from tests.devices.conftest import same, sent
 from tests.devices.elsewhere import DEVICE
-from tests.make import see
+from tests.make import cup_view, see
+from tests.pinch import QUICK, cylinder, pinch
 from torchgrasp import (
     ContactSpec,
     PointCloud,
-    cloud_from_depth,
+    certify,
     explain_empty,
+    fit_shape,
     load_hand,
     load_object,
     load_scene,
@@ -19,10 +25,9 @@ from torchgrasp import (
     plan_scene,
     stream_grasps,
 )
-from torchgrasp.cloud import cut_object, diagnose_cloud, estimate_normals, format_report, save_cloud
-from torchgrasp.cloud.check import remove_duplicates
-from torchgrasp.cloud.prepare import prepare_cloud
+from torchgrasp.cloud import diagnose_cloud, estimate_normals, format_report, save_cloud
 from torchgrasp.evaluation import find_protocol
+from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.evaluation.protocols import draw_object_poses
 from torchgrasp.export import (
     format_graspgen,
@@ -35,7 +40,11 @@ from torchgrasp.export import (
     save_dexgraspbench,
     save_surface,
 )
-from torchgrasp.ik import Obstacles
+from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.ik import CollisionWorld, GraspProblem, Obstacles, PostureLibrary, nearest_postures, solve_joint
+from torchgrasp.ik.attempts import solve_contact_first
+from torchgrasp.ik.candidates import measure_errors
+from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.planner.problem import take_target
@@ -47,8 +56,6 @@ from torchgrasp.testing import random_joints
 
 SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
 VIEW, UP = load_object("cylinder").view, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-CLOSE = torch.full((40, 40), 0.5)
-LENS = torch.tensor([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
 
 PLANS = {
     "stream": lambda cloud, hand: list(stream_grasps(cloud, hand, SPEC, 2)),
@@ -57,12 +64,6 @@ PLANS = {
     "four fingers": lambda cloud, hand: plan_grasps(cloud, load_hand("allegro", 4), SPEC, 1),
     "contacts first": lambda cloud, hand: plan_grasps(cloud, hand, SPEC, 2, mode="contact_first", ranking="variance"),
     "paper": lambda cloud, hand: plan_grasps(cloud, hand, ContactSpec.paper(), 2, mode="paper"),
-}
-CLOUDS = {
-    "remove_duplicates": remove_duplicates,
-    "prepare_cloud": lambda cloud: prepare_cloud(cloud, torch.Generator().manual_seed(0)),
-    "cut_object": lambda cloud: cut_object(cloud, UP.to(cloud.points)),
-    "cloud_from_depth": lambda cloud: cloud_from_depth(CLOSE.to(cloud.points), LENS.to(cloud.points)),
 }
 TEXTS = {
     "grasps": lambda hand, grasps: format_grasps(hand, grasps),
@@ -98,11 +99,6 @@ def test_things_of_a_scene_are_planned_where_it_is(device, hand):
     same(take_target(sent(scene).select(1), 0), take_target(scene.select(1), 0))
     there = plan_scene(sent(scene), hand, starts=1, enough=0.01)
     assert all(thing.grasps is None or thing.grasps.joints.device == DEVICE for thing in there.things)
-
-
-@pytest.mark.parametrize("name", CLOUDS)
-def test_clouds(device, name):
-    same(CLOUDS[name](sent(VIEW)), CLOUDS[name](VIEW))
 
 
 def test_completion_is_on_the_cpu(device):
@@ -152,3 +148,64 @@ def test_trials_are_drawn_on_the_cpu(device):
     noise, pivot = find_protocol("pose-noise").noise, torch.ones(3)
     assert noise is not None
     same(draw_object_poses(noise, sent(pivot), 3, 0), draw_object_poses(noise, pivot, 3, 0), CPU)
+
+
+TURNED = torch.tensor([[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]], dtype=torch.float64)
+
+
+def here(value: Any) -> Any:
+    return value
+
+
+def test_fields_are_asked_where_they_are(device, shape, grasps):
+    def ask(to: Callable[[Any], Any]) -> tuple[torch.Tensor, ...]:
+        surface = extract_surface(to(shape), 24)
+        field = field_from_surface(surface.vertices, surface.faces, 0.01)
+        points = to(grasps.contacts.points)
+        return (*field.query(points), field.nearest_node(points))
+
+    same(ask(sent), ask(here))
+
+
+def test_grasps_are_solved_and_checked_where_their_contacts_are(device, hand, shape, grasps):
+    library = PostureLibrary.of(hand, 300)
+
+    def solve(to: Callable[[Any], Any]) -> list[Any]:
+        there, contacts, its_hand = to(shape), to(grasps.contacts), to(hand)
+        surface = extract_surface(there, 24)
+        world = CollisionWorld(field_from_surface(surface.vertices, surface.faces, 0.01), 0.0)
+        problem = GraspProblem(its_hand, contacts, certify(contacts, SPEC), world, surface.vertices.mean(0))
+        seeds = nearest_postures(to(library), contacts, world, 2)
+        configuration = Configuration(to(grasps.joints), to(grasps.obj_from_hand))
+        return [
+            seeds,
+            measure_errors(its_hand, configuration, contacts, world),
+            solve_contact_first(problem, seeds),
+            solve_joint(problem, seeds, there, SPEC),
+        ]
+
+    same(solve(sent), solve(here))
+
+
+def test_a_shape_is_turned_where_it_is(device, shape):
+    same(sent(shape).moved(sent(TURNED)), shape.moved(TURNED))
+
+
+def test_both_walls_of_a_vessel_are_where_the_cloud_is(device):
+    def fit(to: Callable[[Any], Any]) -> list[Any]:
+        vessel = fit_shape(to(cup_view(0.004)), table=0.0)
+        assert len(vessel.walls) == 2
+        x = to(cup_view(0.004).points[:20].double())
+        return [vessel, vessel.predict(x), vessel.jet(vessel.normalise(x)), vessel.moved(to(TURNED))]
+
+    same(fit(sent), fit(here))
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_a_closing_is_the_same_wherever_hand_and_grasp_are(device):
+    pytest.importorskip("sapien")
+    hand, grasp = pinch("allegro")
+    there, near = (close_hand(to(grasp), to(hand), cylinder(), QUICK) for to in (sent, here))
+    assert there.held and near.held
+    assert np.array_equal(there.forces, near.forces) and np.array_equal(there.object_pose, near.object_pose)

@@ -11,6 +11,7 @@ from torchgrasp import (
     certify,
     closing_gains,
     closure_probability,
+    cloud_from_depth,
     encode,
     fit_mixture,
     fit_shape,
@@ -23,8 +24,9 @@ from torchgrasp import (
     sample_configurations,
     solve_ik,
 )  # fmt: skip
-from torchgrasp.cloud import estimate_normals, remove_outliers, voxel_downsample
-from torchgrasp.cloud.prepare import clean_cloud
+from torchgrasp.cloud import cut_object, estimate_normals, remove_outliers, voxel_downsample
+from torchgrasp.cloud.check import remove_duplicates
+from torchgrasp.cloud.prepare import clean_cloud, prepare_cloud
 from torchgrasp.control import ClosingReference, GraspController, measure, no_contact, observe, squeeze
 from torchgrasp.control.tactile import TipContact
 from torchgrasp.errors import BadArgument
@@ -38,6 +40,10 @@ from torchgrasp.testing import random_joints
 SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
 VIEW = load_object("cylinder").view
 
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+CLOSE = torch.full((40, 40), 0.5)
+LENS = torch.tensor([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
+
 CLOUDS = {
     "fit_shape": lambda cloud: fit_shape(cloud, table=0.0),
     "fit_shape, paper": lambda cloud: fit_shape(cloud, support="paper"),
@@ -49,6 +55,10 @@ CLOUDS = {
     "voxel_downsample": lambda cloud: voxel_downsample(cloud, 0.005),
     "estimate_normals": estimate_normals,
     "PointCloud.select": lambda cloud: cloud.select(torch.arange(5)),
+    "remove_duplicates": remove_duplicates,
+    "prepare_cloud": lambda cloud: prepare_cloud(cloud, torch.Generator().manual_seed(0)),
+    "cut_object": lambda cloud: cut_object(cloud, UP.to(cloud.points)),
+    "cloud_from_depth": lambda cloud: cloud_from_depth(CLOSE.to(cloud.points), LENS.to(cloud.points)),
 }
 SHAPES = {
     "predict": lambda shape, x: shape.predict(x),

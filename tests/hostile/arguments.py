@@ -147,7 +147,6 @@ def tensors_in(hint: Any) -> list[Any]:
 
 
 def public() -> dict[str, Any]:
-    """Return every public function, method and value by name."""
     found: dict[str, Any] = {}
     inner = [m.name for m in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp.") if m.ispkg]
     for package in [torchgrasp, *map(importlib.import_module, inner)]:
@@ -159,7 +158,6 @@ def public() -> dict[str, Any]:
 
 
 def behind(thing: Any) -> bool:
-    """Tell whether a function is behind the border."""
     return hasattr(thing, "__checked__")
 
 
@@ -205,7 +203,6 @@ def _method(thing: type, key: str, still: bool) -> Any:
 
 
 def required(thing: Any, call: Any, path: Path) -> dict[str, Any]:
-    """Return valid arguments for the parameters without a default."""
     hints, parameters = hints_of(thing), inspect.signature(call).parameters
     return {
         key: sample(hints[key], path, own_lengths(call))

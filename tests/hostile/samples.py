@@ -99,13 +99,11 @@ def special(kind: type) -> Any:
 
 
 def few_points() -> PointCloud:
-    """Return some of a shipped view."""
     view = load_object("cylinder").view
     return PointCloud(view.points[:150], None, view.viewpoint)
 
 
 def impedance() -> Impedance:
-    """Return what holds a shipped grasp."""
     reference = special(ClosingReference)
     seen = observe(reference.hand, reference.joints, no_contact())
     return Impedance(reference, seen, seen.joints)

@@ -28,7 +28,6 @@ GOOD = {"views": {"v0": {"T_object_camera": POSE}}}
 
 
 def pose(**changes: object) -> dict:
-    """An entry whose pose or view is another."""
     return {"views": {"v0": {"T_object_camera": POSE} | changes}}
 
 
@@ -87,7 +86,6 @@ def write(folder: Path, entries: object) -> Path:
 
 
 def put(folder: Path, size: float = 0.06, view: str = "v0") -> None:
-    """Write mesh and view of a box into a folder."""
     folder.mkdir(parents=True)
     box = trimesh.creation.box((size, size, size))
     box.apply_translation([0, 0, size / 2])

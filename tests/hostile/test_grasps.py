@@ -23,7 +23,6 @@ from torchgrasp.values import Grasps
 
 @pytest.fixture(scope="module")
 def grasps() -> Grasps:
-    """A few grasps of the cylinder."""
     return plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=12)
 
 
@@ -35,7 +34,6 @@ def write(path: Path, tensors: dict[str, torch.Tensor], meta: Any) -> Path:
 
 
 def header(grasps: Grasps, **changes: Any) -> dict[str, Any]:
-    """The metadata of a good file, but for some changes."""
     return grasps.meta | {"kind": "grasps", "version": "1"} | changes
 
 

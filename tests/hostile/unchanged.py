@@ -68,7 +68,6 @@ def digest(value: Any) -> str:
 
 
 def _parts(value: Any, above: tuple[int, ...]) -> Iterator[bytes]:
-    """Yield the parts of a value as bytes."""
     yield type(value).__name__.encode()
     inner: list[Any] = []
     if id(value) in above:

@@ -28,13 +28,6 @@ def check_kernel(kernel: Kernel, seed: int = 0) -> Kernel:
     * `smooth`: k'(0) = 0, without which surfaces have no normals.
     * `derivatives`: a closed form equals autograd of the profile, which equals finite differences of k.
     * `covariance`: no combination of distances and normals in the ball has a negative variance.
-
-    Args:
-        kernel: of normalised distances, see `Kernel`.
-        seed: of the random points.
-
-    Raises:
-        BrokenLaw: the first law that is broken, what was found, and what is allowed.
     """
     length = _length(kernel)
     _check_start(kernel, length)
@@ -90,12 +83,7 @@ def _check_derivatives(kernel: Kernel, r: Float[Tensor, " n"], length: float) ->
     limit at r = 0, where autograd leaves it out.
     """
     k = float(kernel.profile(torch.zeros(1, dtype=torch.float64)))
-    factors = (
-        torch.ones_like(r) / k,
-        torch.full_like(r, length**2 / k),
-        r**2 * (length**2 / k),
-        r**3 * (length**3 / k),
-    )
+    factors = (torch.ones_like(r) / k, length**2 / k, r**2 * (length**2 / k), r**3 * (length**3 / k))
     given, exact = kernel.derivatives(r, 4), differentiate(kernel.profile, r, 4)
     for order, (a, b, factor) in enumerate(zip(given, exact, factors, strict=True)):
         error = ((a - b) * factor).abs().where((r > NEAR_ZERO) | (order < 3), 0.0)

@@ -39,13 +39,6 @@ def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
     * `overlap`: a hand that begins inside the object is told so.
     * `touch`: a fingertip that sinks onto the object is told to touch.
     * `repeat`: the same commands in a fresh scene give the same bits.
-
-    Args:
-        open_scene: opens a fresh scene of one's own simulator.
-        hand: in the scene; None: the Barrett hand.
-
-    Raises:
-        BrokenLaw: the first law that is broken, what was found, and what is allowed.
     """
     hand = load_hand("barrett") if hand is None else hand
     law = _Laws(open_scene, _spec(hand), hand)
@@ -170,7 +163,6 @@ class _Laws:
         return told
 
     def place(self, *offset: float) -> np.ndarray:
-        """Return the place of the hand moved by an offset [m]."""
         return self.spec.world_from_hand[:3, 3] + offset
 
 

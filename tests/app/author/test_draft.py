@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.hostile.fuzz.limits import limited
+from tests.hostile.fuzz.mutations import limited
 from tests.make import box
 from torchgrasp import ContactSpec, Status, certify, fit_mixture, plan_grasps
 from torchgrasp.app.author.draft import draft_hand
@@ -71,14 +71,6 @@ def test_a_tip_that_is_not_round_gets_a_pad_on_its_side(claw, tip):
     assert depth - 0.002 < float(reach) <= depth + 1e-9
 
 
-def two_fingers(claw):
-    """Cut off the thumb."""
-    text = claw.read_text()
-    first, last = text.index('<link name="thumb_root">'), text.index("</robot>")
-    (claw.parent / "two.urdf").write_text(text[:first] + text[last:])
-    return claw.parent / "two.urdf"
-
-
 def test_of_four_fingers_those_grasp_that_face_each_other(tmp_path):
     """Allegro's thumb faces its fingers; three fingers beside each other practically never do."""
     (tmp_path / "hand.urdf").write_bytes((hands_folder() / "allegro" / "hand.urdf").read_bytes())
@@ -131,8 +123,11 @@ def test_what_cannot_be_guessed_is_asked_for(claw, tmp_path):
     for third, words in (((), "left_tip"), (("nose",), "left_tip"), (("base",), "base")):
         with pytest.raises(BadArgument, match=words):
             draft_hand(claw, ("left_tip", "right_tip", *third))
+    text = claw.read_text()
+    claw.write_text(text[: text.index('<link name="thumb_root">')] + "</robot>")
     with pytest.raises(BadArgument, match="three to five"):
-        draft_hand(two_fingers(claw))
+        draft_hand(claw)
+    claw.write_text(text)
     frame = '<link name="world"/><joint name="w" type="fixed"><parent link="world"/><child link="base"/></joint>'
     claw.write_text(claw.read_text().replace("</robot>", frame + "</robot>"))
     with pytest.raises(HandFileError, match="hand new"):

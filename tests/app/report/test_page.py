@@ -9,6 +9,7 @@ from tests.scores import SCORES
 from torchgrasp.app.report.evaluation import draw_bar, format_evaluation, write_evaluation
 from torchgrasp.app.report.page import format_page, grasp_rows, write_report
 from torchgrasp.app.report.run import closing_sentence, refusal, verdict
+from torchgrasp.app.report.viewer import write_viewer
 from torchgrasp.errors import OutputError, Status
 from torchgrasp.evaluation.intervals import share_over
 from torchgrasp.planner.explain import Explanation, Funnel, Losses, Trial
@@ -63,11 +64,12 @@ def test_report_is_written_whole_with_pictures(run, tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["report.html"]
 
 
-def test_report_into_a_file_as_folder_is_refused(run, tmp_path, monkeypatch):
+@pytest.mark.parametrize("write", [write_report, write_viewer])
+def test_a_page_into_a_file_as_folder_is_refused(run, tmp_path, monkeypatch, write):
     monkeypatch.setattr("torchgrasp.app.report.page.draw_pictures", lambda run: {})
     (tmp_path / "taken").write_text("x")
     with pytest.raises(OutputError):
-        write_report(tmp_path / "taken" / "report.html", run)
+        write(tmp_path / "taken" / "report.html", run)
 
 
 def test_grasp_rows_are_in_millimetres_and_degrees(run):

@@ -1,4 +1,4 @@
-"""Pictures of a run, a scene and a hand."""
+"""Pictures of a run, a scene and a hand; the picture of a scene shows what each pixel was taken for."""
 
 import dataclasses
 import io
@@ -9,8 +9,10 @@ import torch
 from PIL import Image
 
 from torchgrasp import load_scene
+from torchgrasp.app.report import draw_scene
 from torchgrasp.app.report.canvas import SIZE, rgb
 from torchgrasp.app.report.page import draw_pictures
+from torchgrasp.app.report.scene import KINDS, encode_scene, sort_pixels
 from torchgrasp.app.report.solids import PARKED, finger_of_links, solids_from_hand
 from torchgrasp.app.report.stills import (
     OBJECTS,
@@ -22,15 +24,16 @@ from torchgrasp.app.report.stills import (
     facing,
     view_of,
 )
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
+from torchgrasp.scene import Scene
 
 
 def decode(png: bytes) -> np.ndarray:
-    """Return the pixels of a PNG in [0, 1]."""
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) / 255
 
 
-def test_stills_have_their_size_and_show_something(run):
+def test_stills_have_their_size_show_something_and_are_reproducible(run):
     view = view_of(run.cloud)
     stills = {
         "cloud": draw_cloud(run.cloud, run.spec.table),
@@ -43,6 +46,7 @@ def test_stills_have_their_size_and_show_something(run):
         assert pixels.shape == (SIZE[1], SIZE[0], 3), name
         covered = (np.abs(pixels - pixels[0, 0]).sum(-1) > 0.08).mean()
         assert 0.02 < covered < 0.95, (name, covered)
+    assert draw_cloud(run.cloud, run.spec.table) == stills["cloud"]
 
 
 def test_fingers_are_drawn_in_three_hues(run):
@@ -51,10 +55,6 @@ def test_fingers_are_drawn_in_three_hues(run):
     assert ((blue > red + 0.24) & (blue > green + 0.12)).sum() > 500
     assert ((red > blue + 0.35) & (red > green + 0.2)).sum() > 500
     assert ((green > red + 0.24) & (green > blue + 0.02)).sum() > 500
-
-
-def test_pictures_are_reproducible(run):
-    assert draw_cloud(run.cloud) == draw_cloud(run.cloud)
 
 
 @pytest.fixture(scope="module")
@@ -89,35 +89,69 @@ def test_every_fingertip_belongs_to_its_finger_and_the_palm_to_none():
         assert fingers[hand.tree.link_names[0]] == PARKED
 
 
-def test_solids_follow_the_pose_of_the_hand_rigidly():
+def test_solids_follow_the_pose_rigidly_whatever_the_order_of_the_joints_and_lie_at_the_tip():
     hand = load_hand("allegro")
-    joints = hand.expand_joints(((hand.lower + hand.upper) / 2).double())
-    here = torch.eye(4, dtype=torch.float64)
-    there = here.clone()
-    there[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
-    pairs = zip(
-        solids_from_hand(hand, joints, hand.tree.joint_names, here),
-        solids_from_hand(hand, joints, hand.tree.joint_names, there),
-        strict=True,
-    )
-    for a, b in pairs:
-        np.testing.assert_allclose(b.vertices - a.vertices, np.tile([0.1, -0.2, 0.3], (len(a.vertices), 1)), atol=1e-12)
-
-
-def test_the_order_of_the_joints_does_not_matter():
-    hand = load_hand("barrett")
-    joints = hand.expand_joints(hand.upper.double() * 0.5)
-    names = hand.tree.joint_names
-    place = torch.eye(4, dtype=torch.float64)
-    turned = solids_from_hand(hand, joints.flip(0), names[::-1], place)
-    for a, b in zip(solids_from_hand(hand, joints, names, place), turned, strict=True):
-        np.testing.assert_array_equal(a.vertices, b.vertices)
-
-
-def test_a_fingertip_solid_lies_at_the_tip():
-    hand = load_hand("allegro")
-    joints = ((hand.lower + hand.upper) / 2).double()
-    centre = hand.tip_centres(joints)[0].numpy()
-    solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).double())
+    middle = ((hand.lower + hand.upper) / 2).double()
+    joints, names, here = hand.expand_joints(middle), hand.tree.joint_names, torch.eye(4, dtype=torch.float64)
+    there, shift = here.clone(), [0.1, -0.2, 0.3]
+    there[:3, 3] = torch.tensor(shift)
+    solids, moved = (solids_from_hand(hand, joints, names, place) for place in (here, there))
+    turned = solids_from_hand(hand, joints.flip(0), names[::-1], here)
+    for a, b, c in zip(solids, moved, turned, strict=True):
+        np.testing.assert_allclose(b.vertices - a.vertices, np.tile(shift, (len(a.vertices), 1)), atol=1e-12)
+        np.testing.assert_array_equal(a.vertices, c.vertices)
+    centre = hand.tip_centres(middle)[0].numpy()
     middles = [(s.vertices.min(0) + s.vertices.max(0)) / 2 for s in solids if s.finger == 0]
     assert min(np.linalg.norm(m - centre) for m in middles) < 1e-6
+
+
+SHAPE = (120, 160)
+PARTS = {
+    "box": np.s_[40:80, 30:70],
+    "wall": np.s_[:, 140:],
+    "hole": np.s_[90:110, 20:60],
+    "floor": np.s_[90:110, 90:130],
+}
+
+
+def paint(values: dict[str, float], rest: float) -> np.ndarray:
+    image = np.full(SHAPE, rest)
+    for name, value in values.items():
+        image[PARTS[name]] = value
+    return image
+
+
+@pytest.fixture(scope="module")
+def painted():
+    """A camera 0.8 m above a table, which sees a box, a wall, a hole in the measurement, and the floor."""
+    depth = paint({"box": 0.7, "wall": 0.5, "hole": 0.0, "floor": 1.2}, 0.8)
+    labels = paint({"box": 1}, 0).astype(int)
+    table = Plane(torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), -0.8)
+    return Scene.from_depth(depth, (140.0, 140.0, 79.5, 59.5), labels=labels, table=table)
+
+
+def test_every_pixel_has_its_kind(painted):
+    kinds, labels = sort_pixels(painted)
+    names = np.array(list(KINDS))[kinds]
+    assert (names[PARTS["hole"]] == "not measured").all() and (names[PARTS["wall"]] == "obstacle").all()
+    assert (names[PARTS["floor"]] == "not on the support").all() and labels[45:75, 35:65].min() == 1
+    assert (names[0:30, 0:130] == "support, in squares of 10 cm").all() and not labels[0:30].any()
+
+
+def test_objects_have_their_colours_and_unmeasured_pixels_are_black(painted):
+    pixels = decode(encode_scene(painted))
+    assert pixels.shape[1] == 1200 and pixels.shape[0] > 900  # a legend below
+    scale = 1200 / SHAPE[1]
+    body, hole, top = (pixels[int(r * scale), int(c * scale)] for r, c in ((46, 36), (100, 40), (10, 15)))
+    assert np.abs(body / body.max() - np.array(rgb(OBJECTS[0])) / max(rgb(OBJECTS[0]))).max() < 0.03
+    assert hole.max() < 0.1 < 0.6 < top.min()
+
+
+def test_only_a_target_has_a_white_rim(painted):
+    chosen = dataclasses.replace(painted, target=1)
+    white = [(decode(encode_scene(s))[:900] == 1).all(-1).sum() for s in (painted, chosen)]
+    assert white[1] > white[0] + 3000
+
+
+def test_the_picture_is_written_and_reproducible(painted, tmp_path):
+    assert draw_scene(painted, tmp_path / "a.png").read_bytes() == draw_scene(painted, tmp_path / "b.png").read_bytes()

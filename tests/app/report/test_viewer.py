@@ -21,15 +21,13 @@ from torchgrasp.app.report.viewer import (
     format_viewer,
     thin_mesh,
     three,
-    write_viewer,
 )
-from torchgrasp.errors import OutputError, Status
+from torchgrasp.errors import Status
 from torchgrasp.hand.urdf import Shape
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 
 
 def unpack(buffer):
-    """Read a buffer as the page does."""
     values = np.frombuffer(base64.b64decode(buffer["data"]), f"<{buffer['kind']}")
     return values.reshape(buffer["shape"])
 
@@ -137,12 +135,6 @@ def test_a_run_without_grasps_or_closure_has_a_page(run):
 
 def test_the_report_links_to_the_page_only_where_there_is_one(run):
     assert f'href="{VIEW}"' in format_page(run, {}, VIEW) and VIEW not in format_page(run, {})
-
-
-def test_a_page_into_a_file_as_folder_is_refused(run, tmp_path):
-    (tmp_path / "taken").write_text("x")
-    with pytest.raises(OutputError):
-        write_viewer(tmp_path / "taken" / VIEW, run)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.app import cli
@@ -47,7 +46,6 @@ def fail(code: int) -> Happening:
 
 
 def send(sign: int) -> Happening:
-    """Send a signal to the process."""
     return lambda name, given: os.kill(os.getpid(), sign)
 
 
@@ -118,8 +116,3 @@ def _send_all(pipe: int, data: bytes) -> None:
     """Write all of it: a pipe takes 64 KiB at once."""
     while data:
         data = data[REAL["write"](pipe, data) :]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """Return every file below a folder, by its path there."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

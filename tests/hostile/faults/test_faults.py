@@ -16,8 +16,9 @@ from typing import NamedTuple
 
 import pytest
 
+from tests.campaign.cheap import contents
 from tests.hostile.faults.commands import COMMANDS, Command
-from tests.hostile.faults.inject import Ended, Happening, contents, fail, kill, run, send
+from tests.hostile.faults.inject import Ended, Happening, fail, kill, run, send
 from torchgrasp.app import cli
 from torchgrasp.data.shards import load_shard
 from torchgrasp.files import hold_file, hold_folder

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.campaign.cheap import contents
 from tests.hostile.faults.commands import POSE
-from tests.hostile.faults.inject import contents
 from tests.make import start_process
 from torchgrasp.data.shipped import DATA
 
@@ -91,7 +91,6 @@ def words(name: str, folder: Path) -> list[str]:
 
 
 def start(script: str, folder: Path, given: list[str], **environment: str) -> subprocess.Popen[str]:
-    """Start a script of the above."""
     (folder / "script.py").write_text(script)
     own = {"OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(folder / "cache")}
     command = [sys.executable, str(folder / "script.py"), *given]

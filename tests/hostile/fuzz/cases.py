@@ -31,7 +31,6 @@ class Case(NamedTuple):
 
 
 def saved(path: Path, read: Callable[[Path], object]) -> Case:
-    """Return the case of a file that is there."""
     return Case(path, path.read_bytes(), read)
 
 
@@ -108,12 +107,10 @@ def published(folder: Path) -> list[Case]:
 
 
 def tomls(folder: Path) -> list[Case]:
-    """Return the hand.toml of a hand."""
     return [saved(folder / "hand.toml", lambda x: load_hand(x.parent))]
 
 
 def manifests(folder: Path) -> list[Case]:
-    """Return the manifest of a folder of objects."""
     pose = {"T_object_camera": np.eye(4).tolist()}
     cup = {"views": {"front": pose, "back": pose}, "suggested_scale": 0.5, "family": "cups", "mass_kg": 0.2}
     (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": cup | {"group": "shell"}, "jug": cup}}))
@@ -141,4 +138,3 @@ def foreign(folder: Path) -> list[Case]:
 
 
 MAKERS = (clouds, meshes, images, urdfs, published, tomls, manifests, foreign)
-KINDS = {make.__name__: make for make in MAKERS}

@@ -1,6 +1,11 @@
-"""Mutations of good files: bits, bytes, spans, and words that stand where a number, a name or a bracket stood."""
+"""Mutations of good files: bits, bytes, spans and words; and the limits under which the mutated files are read."""
 
+import contextlib
 import re
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 from hypothesis import strategies as st
 
@@ -20,45 +25,37 @@ Edit = tuple[str, int, int]
 
 
 def flip(data: bytearray, at: int, what: int) -> None:
-    """Turn one bit."""
     data[at] ^= 1 << (what % 8)
 
 
 def put(data: bytearray, at: int, what: int) -> None:
-    """Replace one byte."""
     data[at] = what % 256
 
 
 def cut(data: bytearray, at: int, what: int) -> None:
-    """Take out a span."""
     del data[at : at + 1 + what]
 
 
 def end(data: bytearray, at: int, what: int) -> None:
-    """Leave out all that follows."""
     del data[at:]
 
 
 def insert(data: bytearray, at: int, what: int) -> None:
-    """Put a word in between."""
     data[at:at] = WORDS[what % len(WORDS)]
 
 
 def replace(data: bytearray, at: int, what: int) -> None:
-    """Put a word in the place of the next one."""
     found = WORD.search(data, at)
     if found:
         data[found.start() : found.end()] = WORDS[what % len(WORDS)]
 
 
 def copy(data: bytearray, at: int, what: int) -> None:
-    """Put a span from elsewhere over this one."""
     start = what * 257 % len(data)
     data[at : at + 8] = data[start : start + 8]
 
 
 def repeat(data: bytearray, at: int, what: int) -> None:
-    """Write a span many times."""
     data[at:at] = data[at : at + 64] * (what % 256)
 
 
@@ -84,3 +81,38 @@ def edits() -> st.SearchStrategy[list[Edit]]:
     """Return a strategy of one to three edits; words come most often, since they reach the farthest."""
     kinds = st.sampled_from([*EDITS, "replace", "replace", "replace"])
     return st.lists(st.tuples(kinds, st.integers(0, 2**16 - 1), st.integers(0, 255)), min_size=1, max_size=3)
+
+
+SECONDS, BYTES = 5.0, 2**30
+"""What a small file may cost at most."""
+
+
+class TooSlow(Exception):
+    """A reader took more than `SECONDS` of the processor."""
+
+
+@contextlib.contextmanager
+def limited(most: int = BYTES) -> Iterator[None]:
+    """Raise `TooSlow` after `SECONDS` of the processor, and `MemoryError` beyond `most` bytes more than there are.
+
+    Only Linux has both limits; elsewhere there are none.
+    """
+    if sys.platform != "linux":
+        yield
+        return
+    import resource
+
+    def end(*_: object) -> None:
+        raise TooSlow
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    handler = signal.signal(signal.SIGVTALRM, end)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + most, before[1]))
+    signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+        signal.signal(signal.SIGVTALRM, handler)

@@ -60,7 +60,6 @@ def shown(folder: Path) -> list[Case]:
 
 
 def samples(folder: Path) -> list[Case]:
-    """Return the JSON of a folder of samples."""
     write_samples(load_hand("barrett"), SampleSpec(20), folder)
     return [saved(folder / "samples.json", lambda x: load_samples(x.parent).read())]
 
@@ -97,11 +96,9 @@ def checkpoints(folder: Path) -> list[Case]:
 
 
 def parts(folder: Path) -> list[Case]:
-    """Return convex parts as the cache keeps them."""
     ball = trimesh.creation.icosahedron().apply_scale(0.05)
     _save([ball, ball.copy().apply_translation([0.01, 0.0, 0.0])], folder / "parts.safetensors")
     return [saved(folder / "parts.safetensors", lambda x: _load(x, ball))]
 
 
 MAKERS = (models, shown, samples, shards, checkpoints, parts)
-KINDS = {make.__name__: make for make in MAKERS}

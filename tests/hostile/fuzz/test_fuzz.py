@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from tests.hostile.fuzz import cases as strange
 from tests.hostile.fuzz import own
-from tests.hostile.fuzz.limits import limited
-from tests.hostile.fuzz.mutations import edits, mutated
+from tests.hostile.fuzz.mutations import edits, limited, mutated
 from torchgrasp.app.author.draft import draft_hand
 from torchgrasp.errors import GraspError
 
-KINDS = strange.KINDS | own.KINDS
+KINDS = {make.__name__: make for make in (*strange.MAKERS, *own.MAKERS)}
 MOST_LETTERS = 2000
 """Longest message of an error: it shows a part of what was found."""
 SLOWNESS = {"published": 10}
