@@ -3,16 +3,19 @@
 import dataclasses
 import json
 import math
+import re
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from bench import SUBJECTS
 from benchmarks.close.conditions import CONDITIONS, draw_solid
 from benchmarks.close.holding import EDGES, least_grip
 from benchmarks.close.misplaced import _misplace, median_over
-from benchmarks.common import Options, measure
+from benchmarks.common import Options, benches_of, measure
 from benchmarks.gpu.compare import bench_kernel
 from benchmarks.gpu.kernels import kernels
 from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
@@ -55,6 +58,15 @@ def test_kernels_of_the_gpu_bench_agree_with_themselves():
     for kernel in quick:
         small = dataclasses.replace(kernel, sizes=kernel.sizes[:1])
         assert bench_kernel(small, torch.device("cpu"), (1,)).met, kernel.name
+
+
+def test_benches_in_the_documentation_exist_or_have_a_commit():
+    root = Path(__file__).parents[2]
+    cited = re.compile(r"bench\.py (\w+) --only ([a-z]+(?: [a-z]+)*)(.{0,130})", re.DOTALL)
+    for path in (*(root / "docs").rglob("*.md"), *root.glob("*/README.md")):
+        for subject, names, after in cited.findall(path.read_text()):
+            known = benches_of(subject) if subject in SUBJECTS else {}
+            assert set(names.split()) <= set(known) or "commit" in after, (path, subject, names)
 
 
 def test_measure_refuses_an_unknown_bench():
