@@ -1,6 +1,5 @@
 """Campaigns: data sets of clouds, grasps, certificates and simulated verdicts, made by many processes or machines."""
 
-from torchgrasp.campaign.run import CampaignSpec
-from torchgrasp.campaign.run import run_campaign
+from torchgrasp.campaign.run import CampaignSpec, run_campaign
 
 __all__ = ["CampaignSpec", "run_campaign"]

@@ -190,16 +190,10 @@ def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> d
     }
     jobs = [{name: x for name, x in row.as_json().items() if name != "meta"} for row in rows]
     return {
-        "torchgrasp": "grasp-shards",
-        "version": 1,
-        "licence": asked["licence"],
-        "campaign": campaign.meta["campaign"],
-        "jobs_in_shard": asked["jobs_in_shard"],
-        "asked": asked,
-        "counts": counts,
-        "shards_sha256": digests,
+        "torchgrasp": "grasp-shards", "version": 1, "licence": asked["licence"], "campaign": campaign.meta["campaign"],
+        "jobs_in_shard": asked["jobs_in_shard"], "asked": asked, "counts": counts, "shards_sha256": digests,
         "jobs": jobs,
-    }
+    }  # fmt: skip
 
 
 def describe(card: dict[str, Any]) -> str:

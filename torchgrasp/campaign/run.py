@@ -107,23 +107,13 @@ def run_campaign(
     spec = CampaignSpec() if spec is None else spec
     place, test = Path(objects).resolve(), spec.test
     rows = _list_jobs(place, spec)
+    of_hand = {"name": hand.name, "option": hand.source.option, "sha256": hand.source.sha256}
+    of_hand |= {"joint_names": ", ".join(hand.joint_names), "finger_names": ", ".join(hand.finger_names)}
     asked = {
-        "torchgrasp": "campaign",
-        "version": 1,
-        "licence": spec.licence,
-        "objects_sha256": sha256(place / "manifest.json"),
-        "hand": {
-            "name": hand.name,
-            "option": hand.source.option,
-            "sha256": hand.source.sha256,
-            "joint_names": ", ".join(hand.joint_names),
-            "finger_names": ", ".join(hand.finger_names),
-        },
-        "protocol": dataclasses.asdict(test),
-        "trials": dataclasses.asdict(spec.trials),
-        "jobs_in_shard": spec.jobs_in_shard,
-        "versions": versions(),
-    }
+        "torchgrasp": "campaign", "version": 1, "licence": spec.licence,
+        "objects_sha256": sha256(place / "manifest.json"), "hand": of_hand, "protocol": dataclasses.asdict(test),
+        "trials": dataclasses.asdict(spec.trials), "jobs_in_shard": spec.jobs_in_shard, "versions": versions(),
+    }  # fmt: skip
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, hand, test.noise.draws))
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     limit = PLAN_LIMIT + TRIAL_LIMIT * spec.trials.grasps * test.noise.draws

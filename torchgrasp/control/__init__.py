@@ -1,29 +1,14 @@
 """The controller of a hand, real or simulated: grasp and sensor readings in, targets of joints and palm out."""
 
-from torchgrasp.closure import ClosingGains
+from torchgrasp.closure import ClosingGains, ClosingOptions
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.forces import squeeze
-from torchgrasp.control.tactile import Observation, Targets, observe
 from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.sensing import FingertipSensor, feel_flags, feel_torques
-from torchgrasp.control.tactile import TactileState, TipContact, measure, no_contact
-from torchgrasp.closure import ClosingOptions
+from torchgrasp.control.tactile import Observation, TactileState, Targets, TipContact, measure, no_contact, observe
 
 __all__ = [
-    "ClosingGains",
-    "ClosingOptions",
-    "ClosingReference",
-    "FingertipSensor",
-    "GraspController",
-    "Observation",
-    "TactileState",
-    "Targets",
-    "TipContact",
-    "closing_gains",
-    "feel_flags",
-    "feel_torques",
-    "measure",
-    "no_contact",
-    "observe",
-    "squeeze",
-]
+    "ClosingGains", "ClosingOptions", "ClosingReference", "FingertipSensor", "GraspController", "Observation",
+    "TactileState", "Targets", "TipContact", "closing_gains", "feel_flags", "feel_torques", "measure", "no_contact",
+    "observe", "squeeze",
+]  # fmt: skip

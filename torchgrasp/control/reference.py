@@ -12,24 +12,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import ANY, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closure import ClosingGains, SensorModel
-from torchgrasp.control.forces import (
-    check_hand,
-    contacts_in_hand,
-    desired_forces,
-    drive_stiffness,
-    joint_stiffness,
-    press,
-    tip_compliance,
-)
-from torchgrasp.control.law import (
-    FORCE_BANDWIDTH,
-    FORCE_FLOOR,
-    force_covariance,
-    force_gain,
-    joint_step,
-    position_gain,
-    surface_covariance,
-)
+from torchgrasp.control import forces, law
 from torchgrasp.control.paper.stability import StabilityModel
 from torchgrasp.control.tactile import Observation
 from torchgrasp.errors import BadArgument
@@ -108,7 +91,7 @@ class ClosingReference(Value):
                 positive, joints beyond their limits, or numbers in the grasp that are not finite.
         """
         check_single(grasp)
-        check_hand(hand, grasp)
+        forces.check_hand(hand, grasp)
         contacts = grasp.contacts
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
         check_tensor("grasp.contacts.normals", contacts.normals, (1, len(hand.tips), 3))
@@ -118,36 +101,29 @@ class ClosingReference(Value):
         hand, grasp = hand.to("cpu", torch.float64), grasp.to("cpu", torch.float64)
         hand.actuated.check_limits(grasp.joints, "grasp.joints")
         hand.actuated.check_limits(grasp.pregrasp, "grasp.pregrasp")
-        points, normals = contacts_in_hand(grasp)
-        preferred = deviation = None
-        sure = FORCE_FLOOR
+        points, normals = forces.contacts_in_hand(grasp)
+        preferred, deviation, sure = None, None, law.FORCE_FLOOR
         if stability is not None:
             tips = points[0] + hand.tips.radius[:, None] * normals[0]
-            preferred = stability.preferred_forces(tips, force)
+            preferred = stability.preferred_forces(tips, force).forces[None]
             deviation = stability.preferred_forces(tips).covariance.diagonal()[None].sqrt()  # a given force has none
-            sure = math.hypot(FORCE_FLOOR, float(deviation.min()))
-        forces = desired_forces(points, normals, force, None if preferred is None else preferred.forces[None])
-        covariance, jacobian = surface_covariance(normals, std_m), hand.jacobian(grasp.joints, points)
-        alpha_f = FORCE_BANDWIDTH * sure**2 * tip_compliance(jacobian, normals, joint_stiffness(hand))
+            sure = math.hypot(law.FORCE_FLOOR, float(deviation.min()))
+        desired = forces.desired_forces(points, normals, force, preferred)
+        covariance, jacobian = law.surface_covariance(normals, std_m), hand.jacobian(grasp.joints, points)
+        compliance = forces.tip_compliance(jacobian, normals, forces.joint_stiffness(hand))
+        force_covariance = law.force_covariance(desired, normals, deviation)
         gains = ClosingGains(
             target=points[0],
             covariance=covariance[0],
-            position_gain=position_gain(covariance)[0],
-            force_gain=force_gain(force_covariance(forces, normals, deviation), alpha_f)[0],
-            desired_force=forces[0],
+            position_gain=law.position_gain(covariance)[0],
+            force_gain=law.force_gain(force_covariance, law.FORCE_BANDWIDTH * sure**2 * compliance)[0],
+            desired_force=desired[0],
             force_source="analytic" if stability is None else "stability",
         )
-        return cls(
-            hand=hand,
-            kp=drive_stiffness(hand, kp),
-            obj_from_hand=grasp.obj_from_hand[0],
-            pregrasp=grasp.pregrasp[0],
-            joints=grasp.joints[0],
-            squeeze=press(grasp.joints, jacobian, forces, joint_stiffness(hand, kp)).joints[0],
-            normals=normals[0],
-            gains=gains,
-            approach=_approach_in_hand(grasp),
-        )
+        squeeze = forces.press(grasp.joints, jacobian, desired, forces.joint_stiffness(hand, kp)).joints
+        pose, opened, joints = grasp.obj_from_hand[0], grasp.pregrasp[0], grasp.joints[0]
+        stiffness, approach = forces.drive_stiffness(hand, kp), _approach_in_hand(grasp)
+        return cls(hand, stiffness, pose, opened, joints, squeeze[0], normals[0], gains, approach)
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
@@ -199,7 +175,7 @@ def next_target(
 ) -> Float[Tensor, " h"]:
     """Return the joint target [rad] one tick later (Eq. 25); it leads the measured joints by at most `lead` [rad]."""
     jacobian = observation.jacobian @ reference.hand.actuated.coupling
-    step = joint_step(jacobian, velocity, period, reference.joints - target)
+    step = law.joint_step(jacobian, velocity, period, reference.joints - target)
     joints = reference.pick(observation.joints)
     return reference.clamp(torch.minimum(torch.maximum(target + step, joints - lead), joints + lead))
 

@@ -7,17 +7,6 @@ from torchgrasp.data.shards import JobRow
 from torchgrasp.data.reader import GraspShards, ShardJob, read_shards
 
 __all__ = [
-    "GraspObject",
-    "GraspShards",
-    "JobRow",
-    "ShardJob",
-    "list_objects",
-    "list_views",
-    "load_object",
-    "load_scene",
-    "load_shipped_grasp",
-    "read_object_mesh",
-    "read_shards",
-    "read_view",
-    "write_objects",
-]
+    "GraspObject", "GraspShards", "JobRow", "ShardJob", "list_objects", "list_views", "load_object", "load_scene",
+    "load_shipped_grasp", "read_object_mesh", "read_shards", "read_view", "write_objects",
+]  # fmt: skip

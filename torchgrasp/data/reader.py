@@ -79,27 +79,16 @@ class GraspShards:
         """
         i = range(len(self))[operator.index(i)]
         j = bisect.bisect_right(self.starts, i) - 1
-        shard, first = self.recent.get(j // self.size, self._read), j - j % self.size
-        g = i - self.starts[first]
-        p = sum(row.points for row in self.jobs[first:j])
-        records, grasps = shard.records, shard.records.grasps
+        _, records = self.recent.get(j // self.size, self._read).take(j % self.size)
+        grasps, g = records.grasps, i - self.starts[j]
         contacts, certificate = grasps.contacts, grasps.certificate
         item = {
-            "points": _choose(records.points[p : p + self.jobs[j].points], self.points, i),
-            "viewpoint": records.viewpoints[j - first],
-            "joints": grasps.joints[g],
-            "pregrasp": grasps.pregrasp[g],
-            "approach": grasps.approach[g],
-            "obj_from_hand": grasps.obj_from_hand[g],
-            "contacts": contacts.points[g],
-            "normals": contacts.normals[g],
-            "std_m": contacts.require_std()[g],
-            "margin": certificate.margin[g],
-            "witness": certificate.witness[g],
-            "clearance": grasps.clearance[g],
-            "predicted": torch.sigmoid(grasps.score[g]),
-            "simulated": records.passed[g].double().mean(),
+            name: getattr(grasps, name)[g] for name in ("joints", "pregrasp", "approach", "obj_from_hand", "clearance")
         }
+        item |= {"contacts": contacts.points[g], "normals": contacts.normals[g], "std_m": contacts.require_std()[g]}
+        item |= {"margin": certificate.margin[g], "witness": certificate.witness[g]}
+        item |= {"predicted": torch.sigmoid(grasps.score[g]), "simulated": records.passed[g].double().mean()}
+        item |= {"points": _choose(records.points, self.points, i), "viewpoint": records.viewpoints[0]}
         single = {name: x.float() for name, x in item.items()}
         return {**single, "closed": certificate.closed[g], "job": torch.tensor(j)}
 

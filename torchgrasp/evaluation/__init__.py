@@ -11,22 +11,7 @@ from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.evaluation.views import EvaluationSpec
 
 __all__ = [
-    "PROTOCOLS",
-    "ClosingTrace",
-    "Disturbance",
-    "EvaluationSpec",
-    "GraspTrial",
-    "ObjectMotion",
-    "PoseNoise",
-    "Protocol",
-    "ProtocolResult",
-    "PullResult",
-    "PullSpec",
-    "Share",
-    "ViewScore",
-    "close_hand",
-    "evaluate",
-    "find_protocol",
-    "pull_grasp",
-    "summarise",
-]
+    "PROTOCOLS", "ClosingTrace", "Disturbance", "EvaluationSpec", "GraspTrial", "ObjectMotion", "PoseNoise",
+    "Protocol", "ProtocolResult", "PullResult", "PullSpec", "Share", "ViewScore", "close_hand", "evaluate",
+    "find_protocol", "pull_grasp", "summarise",
+]  # fmt: skip

@@ -26,10 +26,7 @@ class GoldenCase(NamedTuple):
 
 
 GOLDEN = (
-    GoldenCase("cylinder", "allegro", True),
-    GoldenCase("jug", "allegro", True),
-    GoldenCase("cylinder", "barrett", True),
-    GoldenCase("jug", "barrett", True),
+    *(GoldenCase(name, hand, True) for hand in ("allegro", "barrett") for name in ("cylinder", "jug")),
     GoldenCase("cylinder", "allegro", False),
     GoldenCase("jug", "barrett", False),
 )

@@ -263,32 +263,21 @@ class _Lift:
             bodies = {"object_pose": ticks.object_pose, "neighbour_pose": ticks.neighbour_pose}
             moved = {name: obj_from_world @ x @ inverse(obj_from_world) for name, x in bodies.items()}
             ticks = dataclasses.replace(ticks, hand_pose=obj_from_world @ ticks.hand_pose, **moved)
+        disturbance = Disturbance(
+            first_stray * self.spec.timestep, torch.from_numpy(robot.stray), torch.from_numpy(robot.most_stray),
+            early=first_stray < min(first_touch), neighbour_pose=ticks.neighbour_pose,
+        )  # fmt: skip
         return ClosureResult(
-            held=status is Status.OK,
-            status=status,
-            time=ticks.time,
-            forces=truth.normal_force,
-            object_pose=ticks.object_pose,
-            hand_pose=ticks.hand_pose,
-            joints=ticks.joints,
+            held=status is Status.OK, status=status, time=ticks.time, forces=truth.normal_force,
+            object_pose=ticks.object_pose, hand_pose=ticks.hand_pose, joints=ticks.joints,
             joint_names=self.run.scene.joint_names,
             contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
             object_motion=self._motion(self.arrived, -1),
             pushed=self._motion(self.arrived, self.touched, in_hand=False),
             before_lift=self._motion(0, self.pressed, in_hand=False),
-            unbalanced=self.unbalanced,
-            slip=self._motion(self.pressed, -1),
-            start_overlap=self.run.overlap,
-            disturbance=Disturbance(
-                first_touch=first_stray * self.spec.timestep,
-                impulse=torch.from_numpy(robot.stray),
-                force=torch.from_numpy(robot.most_stray),
-                early=first_stray < min(first_touch),
-                neighbour_pose=ticks.neighbour_pose,
-            ),
+            unbalanced=self.unbalanced, slip=self._motion(self.pressed, -1), start_overlap=self.run.overlap,
+            disturbance=disturbance,
             trace=ClosingTrace(truth.forces, truth.points, truth.normals, truth.sliding, ticks.blend, *ticks.felt.T),
             phases=torch.tensor(reached, dtype=torch.float64),
-            stops=self.run.controller.stops,
-            attempts=self.run.controller.attempts,
-            seconds=seconds,
-        )
+            stops=self.run.controller.stops, attempts=self.run.controller.attempts, seconds=seconds,
+        )  # fmt: skip

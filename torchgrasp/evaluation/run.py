@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import itertools
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import Annotated
 
@@ -82,7 +82,10 @@ def _evaluate(
 ) -> Generator[ViewScore, None, None]:
     """Yield the scores of all views; `evaluate` has checked the arguments."""
     yield from refused
-    with _shelf(folder, spec.planned) as shelf:
+    with contextlib.ExitStack() as stack:
+        shelf = stack.enter_context(temporary_folder()) if folder is None else Path(folder)
+        if folder is not None and not spec.planned:  # grasps that are only read need no lock
+            stack.enter_context(hold_folder(shelf))
         plans = run_tasks(_plan, [(view, shelf, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
         scores = [
             dataclasses.replace(view.score, seconds=math.nan, refusal=plan) if isinstance(plan, Status) else plan
@@ -96,19 +99,6 @@ def _evaluate(
                 tried = [(at, next(results)) for at in some]
                 attempts = (ProtocolResult(*at, False, x) if isinstance(x, Status) else x for at, x in tried)
                 yield dataclasses.replace(score, attempts=tuple(attempts))
-
-
-@contextlib.contextmanager
-def _shelf(folder: Path | None, planned: bool) -> Iterator[Path]:
-    """Lock the folder of grasps, unless grasps of an earlier call are only read; None: make a temporary folder."""
-    if folder is None:
-        with temporary_folder() as temporary:
-            yield temporary
-    elif planned:
-        yield Path(folder)
-    else:
-        with hold_folder(Path(folder)):
-            yield Path(folder)
 
 
 def _plan(view: View, shelf: Path, friction: float, spec: EvaluationSpec) -> ViewScore:

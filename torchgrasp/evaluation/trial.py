@@ -93,26 +93,14 @@ class TrialDriver:
         true_pose = apply_error(grasp.obj_from_hand[0], trial.error)
         approach = true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
         return SceneSpec(
-            urdf_path=hand.urdf_path,
-            world_from_hand=true_pose.numpy(),
-            joints=_by_name(hand, grasp.pregrasp[0]),
-            drives=drives,
-            tip_links=tuple(hand.tips.links),
-            mesh=body.mesh,
-            parts=list(body.parts),
-            mass=body.mass,
-            friction=spec.friction,
-            gravity=spec.gravity,
-            timestep=spec.timestep,
-            travel=spec.lift_height,
-            approach=tuple(approach.tolist()),
-            table=spec.table,
-            patch=spec.patch,
+            urdf_path=hand.urdf_path, world_from_hand=true_pose.numpy(), joints=_by_name(hand, grasp.pregrasp[0]),
+            drives=drives, tip_links=tuple(hand.tips.links), mesh=body.mesh, parts=list(body.parts), mass=body.mass,
+            friction=spec.friction, gravity=spec.gravity, timestep=spec.timestep, travel=spec.lift_height,
+            approach=tuple(approach.tolist()), table=spec.table, patch=spec.patch,
             height=None if trial.table is None else 0.0,
             neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in trial.neighbours),
-            self_pairs=hand.self_pairs if spec.self_collision else (),
-            yields=spec.components.palm_reach,
-        )
+            self_pairs=hand.self_pairs if spec.self_collision else (), yields=spec.components.palm_reach,
+        )  # fmt: skip
 
     def _body(self, given: "Solid", parts: "Sequence[trimesh.Trimesh] | None", mass: float | None = None) -> Body:
         """Return a body in the simulator's frame, with its convex parts."""

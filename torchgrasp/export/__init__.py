@@ -12,16 +12,7 @@ from torchgrasp.export.postures import format_grasps, format_keyframes
 from torchgrasp.export.ros_messages import format_moveit, format_trajectories
 
 __all__ = [
-    "ForeignGrasps",
-    "check_surface_path",
-    "format_graspgen",
-    "format_grasps",
-    "format_keyframes",
-    "format_moveit",
-    "format_trajectories",
-    "grasps_from_joints",
-    "largest_std",
-    "read_foreign",
-    "save_dexgraspbench",
+    "ForeignGrasps", "check_surface_path", "format_graspgen", "format_grasps", "format_keyframes", "format_moveit",
+    "format_trajectories", "grasps_from_joints", "largest_std", "read_foreign", "save_dexgraspbench",
     "save_surface",
-]
+]  # fmt: skip

@@ -204,27 +204,15 @@ def grasps_from_joints(
     certificate = certify(contacts, spec)
     opened = _open(hand, joints, -pad_normals) if pregrasp is None else hand.check_joints(pregrasp.double().cpu())
     g, f = normals.shape[:2]
+    zeros = torch.zeros(g, f, dtype=torch.float64)
+    meta = {"hand": hand.name, "hand_sha256": hand.source.sha256, "units": "metre, radian"}
+    meta |= {"joint_names": ",".join(hand.joint_names), "finger_names": ",".join(hand.finger_names)}
     return Grasps(
-        joints=joints,
-        pregrasp=opened,
-        approach=rotate(pose, hand.approach.expand(g, 1, 3))[:, 0],
-        obj_from_hand=pose,
-        contacts=contacts,
-        permutation=torch.arange(f).expand(g, f).clone(),
-        tip_error=torch.zeros(g, f, dtype=torch.float64),
-        clearance=hand.self_clearance(joints),
-        normal_angle=torch.zeros(g, f, dtype=torch.float64),
-        certificate=certificate,
-        score=torch.zeros(g, dtype=torch.float64),
-        status=torch.where(certificate.closed, int(Status.OK), int(Status.NOT_CLOSED)),
-        meta={
-            "hand": hand.name,
-            "hand_sha256": hand.source.sha256,
-            "joint_names": ",".join(hand.joint_names),
-            "finger_names": ",".join(hand.finger_names),
-            "units": "metre, radian",
-        },
-    )
+        joints, opened, rotate(pose, hand.approach.expand(g, 1, 3))[:, 0], pose, contacts,
+        permutation=torch.arange(f).expand(g, f).clone(), tip_error=zeros, clearance=hand.self_clearance(joints),
+        normal_angle=zeros, certificate=certificate, score=torch.zeros(g, dtype=torch.float64),
+        status=torch.where(certificate.closed, int(Status.OK), int(Status.NOT_CLOSED)), meta=meta,
+    )  # fmt: skip
 
 
 def _open(hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]) -> Float[Tensor, "g h"]:

@@ -134,13 +134,9 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
     std = surface.std_m.detach().cpu().double().numpy()
     shares = np.clip(std / largest_std(surface), 0.0, 1.0)
     colors = (255 * matplotlib.colormaps["viridis"](shares) + 0.5).astype(np.uint8)  # as in the report
-    mesh = trimesh.Trimesh(
-        vertices=surface.vertices.detach().cpu().double().numpy(),
-        faces=surface.faces.cpu().numpy(),
-        vertex_normals=surface.normals.detach().cpu().double().numpy(),
-        vertex_colors=colors,
-        process=False,
-    )
+    vertices, normals = (x.detach().cpu().double().numpy() for x in (surface.vertices, surface.normals))
+    faces = surface.faces.cpu().numpy()
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False)
     if path.suffix.lower() == ".ply":
         mesh.vertex_attributes["std_m"] = std.astype(np.float32)
     content = mesh.export(file_type=path.suffix.lower()[1:])

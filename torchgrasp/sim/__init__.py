@@ -2,8 +2,7 @@
 
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.sim.scene import Scene
-from torchgrasp.sim.simulated_hand import open_scene
 from torchgrasp.sim.scene_spec import Neighbour, SceneSpec
-from torchgrasp.sim.simulated_hand import SimulatedHand
+from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 
 __all__ = ["Neighbour", "Scene", "SceneSpec", "SimulatedHand", "convex_parts", "open_scene"]

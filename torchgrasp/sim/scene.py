@@ -157,7 +157,8 @@ class Scene(abc.ABC):
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
         """Set the target displacement [m] of the hand from its path and its velocity [m/s], if the mount can yield."""
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
-            check_vector(name, vector)
+            if vector.shape != (3,) or vector.dtype.kind not in "iuf":
+                raise BadArgument(name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers")
         for joint, target, speed in zip(SHIFT_JOINTS, displacement, velocity, strict=True):
             self._move_mount(joint, target, speed)
 
@@ -176,9 +177,3 @@ class Scene(abc.ABC):
     def tip_poses(self) -> np.ndarray:
         """Return the poses (f, 4, 4) of the fingertip links."""
         return np.array([self._pose(tip) for tip in self.tips])
-
-
-def check_vector(name: str, vector: np.ndarray) -> None:
-    """Raise `BadArgument` unless an array holds three numbers."""
-    if vector.shape != (3,) or vector.dtype.kind not in "iuf":
-        raise BadArgument(name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers")

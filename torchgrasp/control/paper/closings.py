@@ -8,11 +8,12 @@ from torch import Tensor
 
 from torchgrasp.checks import checked
 from torchgrasp.control.holding import RAMP, held_forces, regulate
-from torchgrasp.control.law import POSITION_RATE, blend, damped_inverse, joint_step, tip_velocity
+from torchgrasp.control.law import MAX_SPEED, POSITION_RATE, blend, damped_inverse, joint_step, tip_velocity
 from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.tactile import NOISE, STILL, Observation, low_pass
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
+from torchgrasp.geometry.linalg import limit_norm
 from torchgrasp.plan.forces import grasp_map, internal_forces
 
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
@@ -118,9 +119,7 @@ class PositionClosing:
         self.done = bool(self.stopped.all())
         self.integral = self.integral + period * error
         demand = POSITION_RATE * error + integral_rate * self.integral
-        gain, position_only = torch.ones_like(demand), torch.zeros_like(demand[:, 0])
-        velocity = tip_velocity(demand, torch.zeros_like(demand), position_only, gain, gain)
-        velocity = torch.where(self.stopped[:, None], 0.0, velocity)
+        velocity = torch.where(self.stopped[:, None], 0.0, limit_norm(demand, MAX_SPEED))
         step = joint_step(observation.jacobian @ reference.hand.actuated.coupling, velocity, period)
         self.target = reference.clamp(self.target + step)
         return reference.expand(self.target)
