@@ -14,6 +14,7 @@ from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.evaluation import GraspTrial, close_hand
 from torchgrasp.evaluation.lift import LIFT_TIME, lift_grasp
+from torchgrasp.evaluation.score import most_certain_first
 from torchgrasp.evaluation.trial import TrialDriver, derive_reference
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane
@@ -228,6 +229,17 @@ def test_too_little_friction_leaves_the_object_behind():
     result = close("allegro", spec=dataclasses.replace(QUICK, friction=0.02))
     assert not result.held
     assert result.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED)
+
+
+def test_the_most_certain_finger_is_told():
+    _, grasp = pinch("allegro")
+    uneven = torch.tensor([[0.004, 0.002, 0.003]]).double()
+    grasp = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, std_m=uneven))
+    assert most_certain_first((1, 0, 2), grasp)
+    assert not most_certain_first((0, 1, 2), grasp)
+    assert not most_certain_first((), grasp)
+    with pytest.raises(BadArgument, match="exactly one"):
+        most_certain_first((0,), grasp[:0])
 
 
 def test_bad_arguments_are_refused():
