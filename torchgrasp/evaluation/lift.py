@@ -225,10 +225,8 @@ class _Lift:
     def _verdict(self) -> Status:
         """Return the status of a completed trial: held, or the first failure."""
         judged_time = 0.2  # time [s] at the end of a trial in which contacts are counted
-        rise, half = (
-            [float(tick.centre[2] - self.ticks[0].centre[2]) for tick in self.ticks],
-            0.5 * self.spec.lift_height,
-        )
+        half = 0.5 * self.spec.lift_height
+        rise = [float(tick.centre[2] - self.ticks[0].centre[2]) for tick in self.ticks]
         gripped = [bool(tick.touching >= 2) for tick in self.ticks[-self.run.robot.ticks(judged_time) :]]
         if rise[-1] >= half and sum(gripped) > 0.5 * len(gripped):
             slip = self._motion(self.pressed, -1)

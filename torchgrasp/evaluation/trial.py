@@ -223,9 +223,7 @@ def _to_world(grasp: Grasps, obj_from_world: Float[Tensor, "4 4"]) -> Grasps:
         return _rounded(vectors @ world_from_obj[:3, :3].T)
 
     contacts = dataclasses.replace(
-        grasp.contacts,
-        points=to_upright(grasp.contacts.points, obj_from_world),
-        normals=turn(grasp.contacts.normals),
+        grasp.contacts, points=to_upright(grasp.contacts.points, obj_from_world), normals=turn(grasp.contacts.normals)
     )
     pose = _rounded(world_from_obj @ grasp.obj_from_hand)
     return dataclasses.replace(grasp, contacts=contacts, obj_from_hand=pose, approach=turn(grasp.approach))
