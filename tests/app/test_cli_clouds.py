@@ -532,13 +532,15 @@ def test_the_table_that_cut_names_is_that_of_the_next_commands(suffix, tmp_path,
             run_command("grasp", path, "--out", tmp_path / "out", "--hand", "barrett", *options)
         assert abs(as_plane(planned[0]).offset - offset) < 1e-4
     file = read_cloud_file(cut)
-    assert file.table is not None and np.allclose([*file.table.components, file.table.offset], named, atol=1e-4)
+    assert file.table is not None and np.allclose([*file.table.normal.tolist(), file.table.offset], named, atol=1e-4)
     np.savetxt(tmp_path / "pose.txt", np.diag([1.0, -1.0, -1.0, 1.0]))
     moved = ViewOptions(camera_pose=tmp_path / "pose.txt", unit="mm").read(
         "CLOUD",
         save_cloud(PointCloud(100 * torch.rand(50, 3) + torch.tensor([0, 0, 900.0])), thin, Plane.horizontal(7.0)),
     )
-    assert moved.table is not None and np.allclose([*moved.table.components, moved.table.offset], [0, 0, -1, 0.007])
+    assert moved.table is not None and np.allclose(
+        [*moved.table.normal.tolist(), moved.table.offset], [0, 0, -1, 0.007]
+    )
 
 
 def test_a_cloud_gives_a_scene_as_its_depth_image_does(tmp_path, run_command):

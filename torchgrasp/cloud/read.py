@@ -1,7 +1,7 @@
 """Point clouds from and to files. A malformed file is refused by name, and no file runs code."""
 
 import dataclasses
-import io
+import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from torchgrasp.cloud.ply import format_ply, parse_ply
 from torchgrasp.cloud.tables import parse_npy, parse_npz, read_lines
 from torchgrasp.cloud.viewpoint import can_see
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
-from torchgrasp.files import is_file, read_bytes, write_file
+from torchgrasp.files import read_bounded, write_file
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 from torchgrasp.values import PointCloud
@@ -109,12 +109,9 @@ def read_cloud_file(
     }
     if suffix not in parsers:
         raise CloudFileError("path", path, "a file ending in .ply, .pcd, .npz, .npy, .xyz, .txt or .csv")
-    if not is_file(path):
-        raise CloudFileError("path", f"{path}, which is no file", f"a {suffix} file")
-    if path.stat().st_size > CLOUD_BYTES:
-        raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"a file of at most {CLOUD_BYTES} bytes")
+    data = read_bounded(path, CLOUD_BYTES, f"a {suffix} file", functools.partial(CloudFileError, "path"))
     try:
-        arrays = parsers[suffix](read_bytes(path))
+        arrays = parsers[suffix](data)
     except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
         raise CloudFileError("path", f"{path}: {error!r}", f"a well-formed {suffix} file") from error
     return make_cloud(str(path), arrays, position, {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit])
@@ -153,14 +150,13 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
     Traceback (most recent call last):
     torchgrasp.errors.BadArgument: path: expected a file ending in .npz or .ply, got cloud.txt
     """
-    path, buffer = Path(path), io.BytesIO()
+    path = Path(path)
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
-    arrays |= {} if table is None else {"table": np.array([*table.components, table.offset])}
+    arrays |= {} if table is None else {"table": np.array([*table.normal.tolist(), table.offset])}
     if path.suffix.lower() not in (".npz", ".ply"):
         raise BadArgument("path", path, "a file ending in .npz or .ply")
     if path.suffix.lower() == ".npz":
-        np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-        return write_file(path, buffer.getvalue())
+        return write_file(path, lambda file: np.savez_compressed(file, **arrays))  # pyright: ignore[reportArgumentType]
     if cloud.viewpoint is not None and cloud.viewpoint.ndim == 2:
         raise BadArgument("path", path, "a file ending in .npz, for a cloud of several views")
     return write_file(path, format_ply(**arrays))

@@ -1,5 +1,6 @@
 """Tables of numbers from strangers' files: NumPy's formats, none of which runs code, text, images, intrinsics."""
 
+import functools
 import io
 import json
 import math
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.files import is_file, read_bytes
+from torchgrasp.files import check_file, read_bytes
 from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS, JSON_BYTES, LINE_LETTERS, TEXT_COLUMNS, TOML_BYTES
 
 
@@ -172,11 +173,9 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
 def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
     """Return the content and the suffix of a file, or refuse it."""
     path, allowed = Path(path), f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"
-    if not is_file(path):
-        raise BadArgument(name, f"{path}, which is no file", allowed)
-    if path.suffix.lower() not in suffixes or path.stat().st_size > CLOUD_BYTES:
-        found = f"{path} of {path.stat().st_size} bytes"
-        raise BadArgument(name, found, f"{allowed} of at most {CLOUD_BYTES} bytes")
+    check_file(path, CLOUD_BYTES, allowed, functools.partial(BadArgument, name))
+    if path.suffix.lower() not in suffixes:
+        raise BadArgument(name, path, allowed)
     return read_bytes(path), path.suffix.lower()
 
 

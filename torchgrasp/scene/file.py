@@ -1,7 +1,6 @@
 """Scenes in files: a .npz with depth, labels, camera, supports and target."""
 
 import dataclasses
-import io
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +58,7 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
     >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).things
     (1, 2, 3, 4)
     """
-    path, buffer = Path(path), io.BytesIO()
+    path = Path(path)
     if path.suffix.lower() != ".npz":
         raise BadArgument("path", path, "a file ending in .npz")
     labels = np.zeros(scene.image.depth.shape, dtype=np.int32)
@@ -78,5 +77,4 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
         arrays["others"] = np.array([[*plane.normal.tolist(), plane.offset] for plane in scene.others])
     if scene.target is not None:
         arrays["target"] = np.array(scene.target)
-    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-    return write_file(path, buffer.getvalue())
+    return write_file(path, lambda file: np.savez_compressed(file, **arrays))  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,7 @@
 """What a pinhole depth camera measured: from arrays, files and clouds."""
 
 import dataclasses
+import functools
 import math
 import zipfile
 from pathlib import Path
@@ -17,7 +18,7 @@ from torchgrasp.cloud.depth import frustum_of_image, read_depth
 from torchgrasp.cloud.pose import read_camera_pose
 from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
-from torchgrasp.files import is_file, read_bytes
+from torchgrasp.files import read_bounded
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import GRID
@@ -152,12 +153,11 @@ def read_arrays(path: Path) -> dict[str, Any]:
     }
     names = ("depth", "intrinsics", "camera_pose", "labels", "mask", *typed)
     allowed = "a .npz file with depth and intrinsics"
-    if path.suffix.lower() != ".npz" or not is_file(path):
+    if path.suffix.lower() != ".npz":
         raise CloudFileError("path", path, allowed)
-    if path.stat().st_size > CLOUD_BYTES:
-        raise CloudFileError("path", f"{path} of {path.stat().st_size} bytes", f"at most {CLOUD_BYTES} bytes")
+    data = read_bounded(path, CLOUD_BYTES, allowed, functools.partial(CloudFileError, "path"))
     try:
-        arrays = parse_npz(read_bytes(path), names, "depth")
+        arrays = parse_npz(data, names, "depth")
         found = {name: arrays[name] for name in ("depth", "intrinsics")} | arrays
         for name in typed.keys() & found.keys():
             kind, shape = typed[name]

@@ -106,7 +106,7 @@ class CloudOptions(ViewOptions):
         """Return the options with the table that a file holds, unless the user gave one or none."""
         if file.table is None or self.table is not None or self.no_table:
             return self
-        known: Any = {**vars(self), "table": (*file.table.components, file.table.offset)}
+        known: Any = {**vars(self), "table": (*file.table.normal.tolist(), file.table.offset)}
         return CloudOptions(**known)
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
