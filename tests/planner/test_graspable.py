@@ -144,6 +144,14 @@ def test_a_heap_of_specks_costs_no_planning(monkeypatch):
     assert len(plan.things) == 30 and {thing.status for thing in plan.things} == {Status.FEW_PIXELS}
 
 
+@pytest.mark.parametrize("label", [1, 2])
+def test_an_object_partly_hidden_is_less_easy(label):
+    scene = see((-0.1, 0.0, 0.06, 0.1), (0.1, 0.0, 0.06, 0.1))
+    row, column = scene.pixels[scene.labels == label].double().mean(0)
+    hidden = (scene.labels == label) & (scene.pixels[:, 0] > row) & (scene.pixels[:, 1] > column)
+    assert order_by_ease(dataclasses.replace(scene, labels=torch.where(hidden, 0, scene.labels)))[-1] == label
+
+
 def test_a_distant_object_is_less_easy():
     near, far = see((0.1, 0.0, 0.06, 0.1), (-0.15, 0.0, 0.06, 0.1)), None
     coarse = dataclasses.replace(near.image, intrinsics=near.image.intrinsics / 40)

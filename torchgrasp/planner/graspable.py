@@ -122,11 +122,12 @@ def is_vague(shape: ShapeGP) -> bool:
 def order_by_ease(scene: Scene) -> list[int]:
     """Return the labels of a scene's objects, the easiest first; those whose success no trial supports come last.
 
-    An object is easy if it is tall, has free space around it, and has nothing above it; and if the camera is so near
-    that its pixels are smaller than a contact, and sees more of it than fingertips cover. No trial supports an object
-    that is larger than those in the trials, or cut off by the border of the image.
+    An object is easy if it is tall, has free space around it, and has nothing above it; if the camera is so near that
+    its pixels are smaller than a contact, and sees more of it than fingertips cover; and if its picture is convex, so
+    that it is neither partly hidden nor two objects that touch. No trial supports an object that is larger than those
+    in the trials, or cut off by the border of the image.
     """
-    from scipy.spatial import KDTree
+    from scipy.spatial import ConvexHull, KDTree
 
     room, height, side = 0.06, 0.08, 0.01  # [m] more room or height makes nothing easier; side of a column of points
     points, labels, rank = *(x.numpy() for x in _stand_upright(scene)), {}
@@ -146,7 +147,8 @@ def order_by_ease(scene: Scene) -> list[int]:
         pixels = scene.pixels[scene.rows_of(label)]
         pixel = float(scene.image.depth[tuple(pixels.T)].median()) / float(scene.image.intrinsics[0, 0])
         seen = len(pixels) * pixel**2 / (3 * math.pi * TIP_RADIUS**2)
-        clear = min(FLAT_RADII[0] / pixel, 1.0) + min(seen, 1.0)
+        convex = len(pixels) / ConvexHull(pixels.cpu().numpy(), qhull_options="QJ").volume if len(pixels) > 2 else 0.0
+        clear = min(FLAT_RADII[0] / pixel, 1.0) + min(seen, 1.0) + min(convex, 1.0)
         ease = min(gap / room, 1.0) + min(own_height / height, 1.0) - min(5.0 * covered, 1.0) + clear
         radius = np.linalg.norm(own - (own.min(0) + own.max(0)) / 2, axis=1).max()
         rank[label] = (radius > largest_known() or scene.image.at_border(pixels), -ease)
