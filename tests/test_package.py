@@ -100,13 +100,14 @@ def hints(function):
 def test_what_public_functions_take_is_public():
     names = public_names()
     public = {id(value) for value in names.values()}
+    apart = "torchgrasp.control.paper."  # baselines, whose learned model a caller only loads
     hidden = set()
     for name, thing in names.items():
         parts = [thing] if inspect.isfunction(thing) else []
         if isinstance(thing, type):
             parts = [m for key, m in vars(thing).items() if not key.startswith("_") and inspect.isfunction(m)]
         for kind in (kind for part in parts for hint in hints(part) for kind in types_of(hint)):
-            if id(kind) not in public and not kind.__name__.startswith("_"):
+            if id(kind) not in public and not kind.__name__.startswith("_") and not kind.__module__.startswith(apart):
                 hidden.add(f"{kind.__module__}.{kind.__qualname__} in {name}")
     assert hidden == set()
 
