@@ -122,3 +122,10 @@ def test_a_mask_of_object_and_table_is_trimmed_with_a_note():
         assert 0.8 < removed / int((drawn & (labels == 0)).sum()) < 1.2 and removed < seen
         own = scene.pixels[scene.rows_of(target)]
         assert float((labels[own[:, 0], own[:, 1]] == 2).double().mean()) > 0.98
+
+
+def test_a_photograph_is_no_mask():
+    photograph = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    for given in (photograph, photograph.astype(np.int32) @ [1, 256, 0]):
+        with pytest.raises(BadArgument, match=r"mask: expected at most 1000 objects, got 4.* as of a photograph"):
+            read_mask(given, (60, 80))

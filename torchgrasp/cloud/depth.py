@@ -83,10 +83,7 @@ def _points(z_image: Float[Tensor, "h w"], k: Float[Tensor, "3 3"], keep: Bool[T
 
 
 def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> Float[Tensor, "4 3"]:
-    """Return the inward unit normals of the sides of a camera's view, in its frame.
-
-    The sides go through the outermost pixels: left, right, top, bottom. `size` is (h, w).
-    """
+    """Return the inward unit normals of the sides of a camera's view (h, w): left, right, top, bottom."""
     (fx, _, cx), (_, fy, cy) = intrinsics[0].tolist(), intrinsics[1].tolist()
     height, width = size
     sides = [[fx, 0.0, cx], [-fx, 0.0, width - 1 - cx], [0.0, fy, cy], [0.0, -fy, height - 1 - cy]]
@@ -105,12 +102,8 @@ def read_depth(
     image = _as_tensor("depth", depth)
     if image.ndim == 3 and 1 in (image.shape[0], image.shape[-1]):  # one channel
         image = image.squeeze(-1 if image.shape[-1] == 1 else 0)
-    if (
-        image.ndim != 2
-        or not image.numel()
-        or image.dtype in (torch.bool, torch.uint8, torch.int8)
-        or image.is_complex()
-    ):
+    narrow = image.is_complex() or image.dtype in (torch.bool, torch.uint8, torch.int8)
+    if narrow or image.ndim != 2 or not image.numel():
         allowed = "an image (h, w) of floats in metres, or of integers such as uint16 in millimetres"
         raise BadArgument("depth", _describe(depth), allowed)
     metres = _in_metres(image, depth_unit if depth_unit or image.is_floating_point() else scale)

@@ -25,13 +25,7 @@ MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """Consistency of the given normals.
-
-    >>> ball = unit(torch.randn(500, 3)).double()
-    >>> found = compare_normals(0.05 * ball, 2 * ball)
-    >>> found.oriented, found.scaled, int(found.flipped.sum())
-    (True, 500, 0)
-    """
+    """Consistency of the given normals."""
 
     flipped: Bool[Tensor, "n"]  # whether a normal opposes most of its neighbours' normals
     opposed: float  # share of opposite normals among pairs of neighbours
@@ -82,9 +76,8 @@ def prepare_cloud(
         if len(count) > max_views:
             raise BadArgument("viewpoint", f"{len(count)} different cameras", f"at most {max_views} cameras")
         if int(count.min()) < min_points:
-            raise TooFewPoints(
-                "points", f"{count.min()} points of one view", f"at least {min_points} points of each view"
-            )
+            allowed = f"at least {min_points} points of each view"
+            raise TooFewPoints("points", f"{count.min()} points of one view", allowed)
     if normals is not None and not compare_normals(points.double(), normals.double()).oriented:
         normals = None
     if clean and normals is not None and viewpoint is not None and share_facing(points, normals, viewpoint) < FACING:

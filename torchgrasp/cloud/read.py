@@ -163,20 +163,7 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
 
 
 def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = None, scale: float = 1.0) -> CloudFile:
-    """Return the cloud of arrays without missing rows; normals of length zero count as missing.
-
-    Args:
-        source: name of the file in errors.
-        arrays: "points" (n, 3) or (h, w, 3), or 3 or 6 "columns"; optionally "normals", "viewpoint" and its "frustum",
-            and the "table" as normal and offset.
-        viewpoint: the camera [m], instead of the arrays' viewpoint.
-        scale: metres in a unit of the arrays.
-
-    Raises:
-        CloudFileError: arrays of another shape or type; more than 5 million points.
-        BadArgument: a viewpoint that is not finite.
-        TooFewPoints: fewer than 4 rows are left.
-    """
+    """Return the cloud of named arrays in a unit of `scale` [m], without rows that were not measured."""
     notes: list[str] = []
     if "columns" in arrays:
         arrays = _split_columns(source, arrays, notes)
@@ -189,9 +176,8 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
         if not bool(torch.isfinite(viewpoint).all()):
             raise BadArgument("path", f"{source}: a viewpoint with NaN or infinity", "a viewpoint of finite numbers")
     if normals is not None and len(normals) != len(points):
-        raise CloudFileError(
-            "path", f"{source}: {len(normals)} normals of {len(points)} points", "one normal for each point"
-        )
+        found = f"{source}: {len(normals)} normals of {len(points)} points"
+        raise CloudFileError("path", found, "one normal for each point")
     if viewpoint is not None and viewpoint.ndim == 2 and len(viewpoint) != len(points):
         found = f"{source}: {len(viewpoint)} viewpoints of {len(points)} points"
         raise CloudFileError("path", found, "one viewpoint, or one for each point")
@@ -231,9 +217,8 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{source}: {name} of type {array.dtype}", "real numbers")
     if array.ndim not in ((1, 2, 3) if name == "viewpoint" else (2, 3)) or array.shape[-1] != 3:
-        raise CloudFileError(
-            "path", f"{source}: {name} of shape {array.shape}", "an array of shape (n, 3), or (h, w, 3) of an image"
-        )
+        allowed = "an array of shape (n, 3), or (h, w, 3) of an image"
+        raise CloudFileError("path", f"{source}: {name} of shape {array.shape}", allowed)
     if array.size > 3 * CLOUD_POINTS:
         raise CloudFileError("path", f"{source} with {array.size // 3} points", f"at most {CLOUD_POINTS} points")
     # A copy is owned, writable and of native bytes. Numbers beyond double precision become infinite, as if missing.
@@ -247,9 +232,8 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     table = np.asarray(arrays["columns"])
     if table.ndim not in (2, 3) or table.shape[-1] not in (3, 6) or table.dtype.kind not in "fiu":
         found = f"{source}: an array of shape {table.shape} and type {table.dtype}"
-        raise CloudFileError(
-            "path", found, "real numbers of shape (n, 3) or (n, 6), or (h, w, 3) or (h, w, 6) of an image"
-        )
+        allowed = "real numbers of shape (n, 3) or (n, 6), or (h, w, 3) or (h, w, 6) of an image"
+        raise CloudFileError("path", found, allowed)
     split = {**arrays, "points": table[..., :3]}
     if table.shape[-1] == 6:
         more = table[..., 3:].reshape(-1, 3).astype(np.float64)

@@ -110,13 +110,7 @@ def _explain(
 def share_unseen(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
 ) -> tuple[float, float]:
-    """Return the shares of points that a camera would see edge-on, and of points behind others or behind the camera.
-
-    Args:
-        points: without outliers [m].
-        normals: of unit length and any sign.
-        viewpoint: the camera [m].
-    """
+    """Return the shares of points that a camera would see edge-on, and of points behind others or behind the camera."""
     from scipy.spatial import KDTree
 
     ray = unit(points - viewpoint)

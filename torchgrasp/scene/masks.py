@@ -15,6 +15,7 @@ from torchgrasp.geometry.support import Support
 from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
 from torchgrasp.scene.segment import count_labels, on_surface, segment
 
+MOST_LABELS = 1000  # more values are those of a photograph
 MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a box drawn around an object are
 
 
@@ -30,7 +31,7 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
         name: of the argument, in errors.
 
     Raises:
-        BadArgument: another shape, negative or broken numbers, or run lengths of another size.
+        BadArgument: another shape, negative or broken numbers, run lengths of another size, or over 1000 values.
 
     >>> read_labels({"size": [2, 3], "counts": [1, 2, 3]}, (2, 3))
     tensor([[0, 1, 0],
@@ -40,7 +41,12 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
         labels = labels["annotations"]
     masks = _masks(labels, shape)
     if masks is None:
-        return _read_one(labels, shape, name)
+        read = _read_one(labels, shape, name)
+        if len(read.unique()) > MOST_LABELS + 1:
+            raise BadArgument(
+                name, f"{len(read.unique())} values, as of a photograph", f"at most {MOST_LABELS} objects"
+            )
+        return read
     stack, size = torch.zeros(shape, dtype=torch.long), torch.zeros(shape, dtype=torch.long)
     for k, mask in enumerate(masks, start=1):
         inside = _read_one(mask, shape, name) > 0
@@ -150,13 +156,13 @@ def label_image(
         kept = torch.where(on_surface(image, support.plane), labels, 0)
         if not bool((kept > 0).any()):
             raise BadArgument("labels", "none that rises above the table", "labels of objects on the table")
-        low = torch.where(_on_support(image, support) & (kept == 0), labels, 0)
-        return kept, tuple(
-            note
-            for k in labels.unique().tolist()
-            for note in _removed(f"mask {k}", int((low == k).sum()), int(((labels == k) & (image.depth > 0)).sum()))
-            if k > 0
+        names, own = labels.unique(return_inverse=True)
+        lost, seen = (
+            torch.bincount(own[pixels], minlength=len(names)).tolist()
+            for pixels in (_on_support(image, support) & (kept == 0), image.depth > 0)
         )
+        counts = zip(names.tolist(), lost, seen, strict=True)
+        return kept, tuple(note for k, *count in counts if k > 0 for note in _removed(f"mask {k}", *count))
     objects = segment(image, support)
     if mask is None:
         return objects, ()
