@@ -93,6 +93,8 @@ def test_a_transparent_picture_has_no_object_there():
         ({"size": list(SHAPE), "counts": [1, 2]}, "run lengths"),
         ({"size": list(SHAPE), "counts": "\x7f"}, "run lengths"),
         ({"counts": [12]}, "run lengths"),
+        ({"size": list(SHAPE), "counts": [2**62, 2**62, 2**62, 2**62, 12]}, "run lengths"),
+        ([LABELS == 1] * 1001, "1001 masks"),
         ([[[1, 2], [1]], [[1]]], "whole numbers"),
         ([{"segmentation": [1, 2, 3, 4]}], "got shape"),
         (functools.reduce(lambda inner, _: [{"segmentation": inner}], range(3000), [1]), "whole numbers"),

@@ -47,6 +47,8 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
                 name, f"{len(read.unique())} values, as of a photograph", f"at most {MOST_LABELS} objects"
             )
         return read
+    if len(masks) > MOST_LABELS:
+        raise BadArgument(name, f"{len(masks)} masks", f"at most {MOST_LABELS}")
     stack, size = torch.zeros(shape, dtype=torch.long), torch.zeros(shape, dtype=torch.long)
     for k, mask in enumerate(masks, start=1):
         inside = _read_one(mask, shape, name) > 0
@@ -116,7 +118,7 @@ def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Te
         if isinstance(counts, str | bytes):
             counts = _run_lengths(counts.encode("ascii") if isinstance(counts, str) else counts)
         runs = np.asarray(counts, dtype=np.int64)
-        if size != list(shape) or (runs < 0).any() or runs.sum() != np.prod(shape):
+        if size != list(shape) or ((runs < 0) | (runs > np.prod(shape))).any() or runs.sum() != np.prod(shape):
             raise ValueError(f"size {size}, sum {runs.sum()}")
     except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise BadArgument(name, f"{type(error).__name__} ({error}) in run lengths", allowed) from error
