@@ -206,31 +206,20 @@ def test_the_camera_pose_moves_a_cloud_out_of_its_camera_s_frame(tmp_path, plann
 def test_the_vertical_and_the_table_become_a_plane(tmp_path, planned):
     write(tmp_path / "a.npz", turned(jug(), [1, 0, 0], [0, 0, 1], [0, -1, 0]))  # y up
     up, lowest = ["--up", "0", "2", "0"], float(remove_outliers(jug()).points[:, 2].min())
-    for options, height in (
-        (up, lowest),
-        ([*up, "--table", "-0.01"], -0.01),
-        (["--table", "0", "2", "0", "-0.02"], -0.01),
-    ):
+    moved = [*up, "--table", "-0.01"], ["--table", "0", "2", "0", "-0.02"]
+    for options, height in zip((up, *moved), (lowest, -0.01, -0.01), strict=True):
         cli.main(["grasp", str(tmp_path / "a.npz"), "--hand", "barrett", "--out", str(tmp_path / "out"), *options])
         table = planned[-1][1].table
         assert isinstance(table, Plane) and table.normal.tolist() == [0, 1, 0]
         assert table.offset == pytest.approx(height, abs=1e-12)
 
 
-BAD = {
-    "up of zero": (["--up", "0", "0", "0"], "--up"),
-    "table of two numbers": (["--table", "0", "1"], "--table"),
-    "table without a normal": (["--table", "0", "0", "0", "1"], "--table"),
-    "NaN table": (["--table", "nan"], "--table"),
-    "two viewpoints": (["--viewpoint", "0", "0", "1", "--no-viewpoint"], "--viewpoint"),
-    "no pose": (["--camera-pose", "none.npy"], "--camera-pose"),
-}
+BAD = "--up 0 0 0; --table 0 1; --table 0 0 0 1; --table nan; --viewpoint 0 0 1 --no-viewpoint; --camera-pose no"
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_options_are_refused_in_one_sentence(name, refusal):
-    options, words = BAD[name]
-    assert refusal("cloud", "check", VIEW, *options).startswith(f"{words}: ")
+@pytest.mark.parametrize("options", BAD.split("; "))
+def test_bad_options_are_refused_in_one_sentence(options, refusal):
+    assert refusal("cloud", "check", VIEW, *options.split()).startswith(f"{options.split()[0]}: ")
 
 
 def test_cut_leaves_the_thing_at_the_point_without_the_table(tmp_path, capsys):
@@ -245,11 +234,8 @@ def test_cut_leaves_the_thing_at_the_point_without_the_table(tmp_path, capsys):
         for options, wanted in (([], "jug"), (["--point", *at], "ball")):
             assert cli.main(["cloud", "cut", path, "--out", str(tmp_path / "b.npz"), *up, *options]) == 0
             thing = read_cloud(tmp_path / "b.npz").points
-            points = (
-                thing
-                if name == "z"
-                else turned(PointCloud(thing, None, thing[0]), [1, 0, 0], [0, 0, -1], [0, 1, 0]).points
-            )
+            back = ([1, 0, 0], [0, 1, 0], [0, 0, 1]) if name == "z" else ([1, 0, 0], [0, 0, -1], [0, 1, 0])
+            points = turned(PointCloud(thing, None, thing[0]), *back).points
             of_ball = (points - torch.tensor([0.2, 0.05, 0.03]).double()).norm(dim=1) < 0.04
             assert float((of_ball == (wanted == "ball")).double().mean()) > 0.99
             assert len(thing) > 300 and float(points[:, 2].min()) < 0.03
@@ -269,10 +255,8 @@ def test_scene_is_that_of_the_depth_image(tmp_path, capsys):
     words = ["cloud", "scene", str(tmp_path / "depth.npy"), "--intrinsics", *numbers, "--out", str(tmp_path / "s.npz")]
     assert cli.main([*words, "--camera-pose", str(tmp_path / "pose.txt")]) == 0
     found, said = read_scene(tmp_path / "s.npz"), capsys.readouterr().out
-    assert (
-        len(found.things) == len(load_scene().things) == len(re.findall(r"^object ", said, re.MULTILINE))
-        and found.target is None
-    )
+    assert len(found.things) == len(load_scene().things) == len(re.findall(r"^object ", said, re.MULTILINE))
+    assert found.target is None
     assert found.table is not None and abs(found.table.offset) < 0.002  # the shipped scene stands at z = 0
     shipped, on_target = load_scene(), np.zeros(tuple(image.depth.shape), dtype=bool)
     on_target[tuple(shipped.pixels[shipped.rows_of(2)].T.numpy())] = True
@@ -309,33 +293,32 @@ def test_scene_takes_the_median_of_frames_of_a_still_camera(tmp_path, capsys):
     assert "replace" in capsys.readouterr().err
 
 
-def test_scene_draws_a_picture_beside_it_that_replaces_no_input(tmp_path, capsys):
-    depth = np.full((120, 160), 0.8, dtype=np.float32)
+@pytest.fixture
+def square(tmp_path):
+    """Words that make a scene of a plane 0.8 m away with a square 0.7 m away, but for the output."""
+    depth = np.full((120, 160), 0.8)
     depth[40:80, 60:100] = 0.7
-    Image.fromarray(np.uint16(1e3 * depth)).save(tmp_path / "depth.png")
-    words = ["cloud", "scene", str(tmp_path / "depth.png"), "--intrinsics", "140", "140", "79.5", "59.5", "--out"]
-    assert cli.main([*words, str(tmp_path / "depth.npz")]) == 2
-    assert "replace" in capsys.readouterr().err and not (tmp_path / "depth.npz").exists()
-    assert cli.main([*words, str(tmp_path / "scene.npz")]) == 0
-    assert str(tmp_path / "scene.png") in capsys.readouterr().out
+    Image.fromarray(np.uint16(np.round(1e3 * depth))).save(tmp_path / "depth.png")
+    return ["cloud", "scene", tmp_path / "depth.png", "--intrinsics", "140", "140", "79.5", "59.5", "--out"]
+
+
+def test_scene_draws_a_picture_beside_it_that_replaces_no_input(square, tmp_path, run_command, refusal):
+    assert "replace" in refusal(*square, tmp_path / "depth.npz") and not (tmp_path / "depth.npz").exists()
+    code, said, _ = run_command(*square, tmp_path / "scene.npz")
+    assert code == 0 and str(tmp_path / "scene.png") in said
     with Image.open(tmp_path / "scene.png") as picture:
         assert picture.width == 1200
 
 
-def test_scene_takes_the_table_the_vertical_and_a_pixel_of_the_target(tmp_path, capsys):
-    depth = np.full((120, 160), 0.8)
-    depth[40:80, 60:100] = 0.7
-    np.save(tmp_path / "depth.npy", depth)
-    words = ["cloud", "scene", str(tmp_path / "depth.npy"), "--intrinsics", "140", "140", "79.5", "59.5", "--out"]
-    words.append(str(tmp_path / "scene.npz"))
+def test_scene_takes_the_table_the_vertical_and_a_pixel_of_the_target(square, tmp_path, run_command, refusal):
+    words = [*square, tmp_path / "scene.npz"]
     for options in (["--table", "0", "0", "-2", "-1.6"], ["--up", "0", "0.1", "-1", "--point", "80", "60"]):
-        assert cli.main([*words, *options]) == 0
+        assert run_command(*words, *options)[0] == 0
         seen = read_scene(tmp_path / "scene.npz")
         assert seen.table is not None and abs(seen.table.offset + 0.8) < 0.001
         assert seen.target == (1 if "--point" in options else None)
-    for bad in (["--table", "0", "1"], ["--table", "0", "0", "0", "1"], ["--up", "0", "0", "0"], ["--point", "5", "5"]):
-        capsys.readouterr()
-        assert cli.main([*words, *bad]) == 2 and capsys.readouterr().err.startswith(f"torchgrasp: {bad[0]}: expected ")
+    for bad in ("--table 0 1", "--table 0 0 0 1", "--up 0 0 0", "--point 5 5"):
+        assert refusal(*words, *bad.split()).startswith(f"{bad.split()[0]}: expected ")
 
 
 def test_a_mesh_or_a_table_that_contradicts_the_cloud_is_told_before_the_work(tmp_path, refusal, monkeypatch):

@@ -36,21 +36,12 @@ def run() -> Run:
     pose[:, 2, 3] = 0.1
     certificate = Certificate(0.02 * one, 0.3 * one, 1e-12 * one, one > 0, torch.zeros(2, 6))
     status = torch.tensor([Status.OK, Status.TIP_ERROR])
+    meta = {"hand": "allegro", "seed": "7", "units": "metre, radian", "note": "<script>alert(1)</script>"}
+    order = torch.tensor([[0, 1, 2], [2, 1, 0]])
     grasps = Grasps(
-        joints,
-        joints,
-        out[:, 0],
-        pose,
-        contacts,
-        torch.tensor([[0, 1, 2], [2, 1, 0]]),
-        small,
-        0.004 * one,
-        math.pi * small,
-        certificate,
-        one,
-        status,
-        {"hand": "allegro", "seed": "7", "units": "metre, radian", "note": "<script>alert(1)</script>"},
-    )
+        joints, joints, out[:, 0], pose, contacts, order, small, 0.004 * one, math.pi * small, certificate, one, status,
+        meta,
+    )  # fmt: skip
     steps = 5
     time = torch.linspace(0, 1, steps, dtype=F64)
     lifted = torch.eye(4, dtype=F64).repeat(steps, 1, 1)
