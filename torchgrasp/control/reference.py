@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,7 +13,6 @@ from torchgrasp.base import Value
 from torchgrasp.checks import ANY, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closure import ClosingGains, SensorModel
 from torchgrasp.control import forces, law
-from torchgrasp.control.paper.stability import StabilityModel
 from torchgrasp.control.tactile import Observation
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
@@ -22,6 +21,9 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values import Grasps
+
+if TYPE_CHECKING:
+    from torchgrasp.control.paper.stability import StabilityModel
 
 
 @checked
@@ -74,7 +76,7 @@ class ClosingReference(Value):
         grasp: Grasps,
         force: Annotated[float, Range(0.01, 100.0)] = 4.0,
         kp: Positive | None = None,
-        stability: StabilityModel | None = None,
+        stability: "StabilityModel | None" = None,
     ) -> "ClosingReference":
         """Derive the closing plan of one grasp, on the CPU.
 
@@ -191,7 +193,7 @@ def closing_gains(
     grasp: Grasps,
     hand: Hand,
     force: Annotated[float, Range(0.01, 100.0)] = 4.0,
-    stability: StabilityModel | None = None,
+    stability: "StabilityModel | None" = None,
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
 
