@@ -147,17 +147,13 @@ def collision_cost(
 
 def clearance_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
     """Return residuals for the smallest clearances: between links, from object, obstacles and table."""
-    return [self_rows(spatial), *sphere_rows(spatial, world, tips_touch)]
-
-
-def self_rows(spatial: SpatialJacobian) -> Rows:
-    """Return residuals for the smallest clearances between the hand's links."""
     pairs, moves = spatial.hand.self_collision, spatial.hand.motion.moves
     separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
     separation, index = separation.T.topk(min(HINGES, len(pairs.pairs)), dim=1, largest=False, sorted=False)
     wrench = wrench.T[number.T.gather(1, index)] / -MILLIMETRE
     first, second = moves[pairs.link[pairs.pairs]].to(wrench).unbind(1)
-    return Rows((SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE, wrench, (second - first)[index])
+    between = Rows((SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE, wrench, (second - first)[index])
+    return [between, *sphere_rows(spatial, world, tips_touch)]
 
 
 def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:

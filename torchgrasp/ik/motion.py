@@ -17,6 +17,7 @@ from torchgrasp.values import Grasps
 
 APPROACH_DISTANCE = 0.1  # length [m] of the straight approach: about the depth of a hand
 COARSE_STEPS, FINE_STEPS = 8, 16  # positions on each candidate path, and on a chosen path
+UP = torch.tensor([0.0, 0.0, 1.0])
 Spheres = Float[Tensor, "g s 3"]
 
 
@@ -82,36 +83,31 @@ def motion_clearance(
 ) -> Float[Tensor, "g"]:
     """Return the least clearance [m] from obstacles while the hand closes and lifts."""
     assert world.obstacles is not None
-    up = torch.tensor([0.0, 0.0, 1.0]) if world.plane is None else world.plane.normal
+    up = UP if world.plane is None else world.plane.normal
     centres = torch.cat([_closing(hand, configuration, pregrasp), _lift(hand, configuration, up)], 1)
     return (world.obstacles.field.query(centres)[0] - hand.collision_spheres.radius.to(centres)).flatten(1).amin(1)
 
 
 @checked
-def collision_probability(
-    hand: Hand, grasps: Grasps, obstacles: Obstacles, up: Float[Tensor, "3"] | None = None
-) -> Float[Tensor, "g"]:
-    """Return the probability that the hand collides during approach, closing and lift.
+def collision_probability(hand: Hand, grasps: Grasps, obstacles: Obstacles) -> Float[Tensor, "g"]:
+    """Return the probability that the hand collides during approach, closing and lift along z: that of any swept voxel.
 
-    Hidden voxels behind one object are occupied or free together, so the largest probability among the swept voxels
-    counts. `up` is the direction of the lift; None: z.
+    Hidden voxels behind one object are occupied or free together, so the largest probability counts.
     """
-    up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
     configuration = Configuration(grasps.joints, grasps.obj_from_hand)
     opened = _centres(hand, Configuration(grasps.pregrasp, grasps.obj_from_hand))
     back = torch.arange(1, COARSE_STEPS + 1).to(opened) * (APPROACH_DISTANCE / COARSE_STEPS)
     approach = opened[:, None] - back[:, None, None] * grasps.approach[:, None, None]
-    closing, lift = _closing(hand, configuration, grasps.pregrasp), _lift(hand, configuration, up)
+    closing, lift = _closing(hand, configuration, grasps.pregrasp), _lift(hand, configuration, UP)
     centres = torch.cat([approach, closing, lift], 1)
     radius = hand.collision_spheres.radius.to(centres).repeat(centres.shape[1])
     return obstacles.likelihood(centres.flatten(1, 2), radius)
 
 
 @checked
-def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles, up: Float[Tensor, "3"] | None = None) -> float:
-    """Return the clearance [m] of the object's lifted surface from obstacles; far below 0 if one lies on it."""
-    up = torch.tensor([0.0, 0.0, 1.0]) if up is None else up
-    return float(obstacles.field.query(_lifted(vertices, up))[0].min()) if len(vertices) else math.inf
+def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> float:
+    """Return the clearance [m] of the object's surface, lifted along z; far below 0 if an obstacle lies on it."""
+    return float(obstacles.field.query(_lifted(vertices, UP))[0].min()) if len(vertices) else math.inf
 
 
 def _closing(hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"]) -> Float[Tensor, "g k s 3"]:

@@ -147,12 +147,9 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> Conta
         good[Status.NOT_FLAT] = torch.ones_like(closed).index_put((rows,), flat_rows)
     good[Status.NOT_CLOSED] = closed
     std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
-    return ContactPlan(
-        Contacts(metres, normals, jet.variance, std_m),
-        coefficients.unflatten(1, wrench.shape[1:3]),
-        torch.linalg.vector_norm(points.mean(1), dim=-1) * shape.scale,
-        first_violation(good),
-    )
+    contacts, phi = Contacts(metres, normals, jet.variance, std_m), coefficients.unflatten(1, wrench.shape[1:3])
+    quality = torch.linalg.vector_norm(points.mean(1), dim=-1) * shape.scale
+    return ContactPlan(contacts, phi, quality, first_violation(good))
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:

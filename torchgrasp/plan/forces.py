@@ -178,7 +178,7 @@ def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "
         decrement = (-(gradient * step).sum(1)).clamp(min=0).sqrt()
         # Multiples of a step that is safe for every self-concordant function.
         tried = z[:, None] + (lengths / (1 + decrement[:, None]))[..., None] * step[:, None]  # (b, l, k)
-        normal, tangential = _sizes(push, slide, tried)
+        normal, tangential = _size(push, slide, tried)
         widest = tau[:, None, None] * normal
         logs = ((widest - tangential).log() + (widest + tangential).log()).sum(-1)
         value = (tried @ linear[..., None])[..., 0] - logs
@@ -203,9 +203,7 @@ def _null_space(points: Vectors) -> Float[Tensor, "b f 3 k"]:
     return torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:].unflatten(1, points.shape[1:])
 
 
-def _sizes(
-    push: Push, slide: Slide, z: Float[Tensor, "b l k"]
-) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:
+def _size(push: Push, slide: Slide, z: Float[Tensor, "b l k"]) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:
     """Return the sizes of normal and tangential forces for l coordinate vectors z."""
     tangential = (slide.flatten(1, 2) @ z.mT).unflatten(1, slide.shape[1:3])  # (b, f, 3, l)
     return z @ push.mT, torch.linalg.vector_norm(tangential, dim=2).mT
@@ -213,5 +211,5 @@ def _sizes(
 
 def _needed(push: Push, slide: Slide, z: Float[Tensor, "b k"]) -> Float[Tensor, "b"]:
     """Return the largest ratio of tangential to normal force over the contacts: the friction needed."""
-    normal, tangential = _sizes(push, slide, z[:, None])
+    normal, tangential = _size(push, slide, z[:, None])
     return (tangential / normal)[:, 0].amax(1)

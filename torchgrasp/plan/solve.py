@@ -20,14 +20,9 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import ContactPlan
 
-SEARCH = (Stage(centre=3.0, cones=0.3, steps=10), Stage(centre=1.0, cones=3.0, steps=6)) * 4 + (
-    Stage(centre=0.3, cones=0.3, steps=8),
-    Stage(centre=0.3, cones=3.0, steps=8),
-)
-"""Stages from starts anywhere: centre and closure by turns, each of which leads out of places where the other is stuck.
-The last two give way where the centre cannot be reached."""
-TO_CENTRE = (Stage(centre=0.3, cones=3.0, steps=8, exact=False),)
-"""The stage from rows of candidates, most of which are feasible but for rounding: towards the centre, Eq. (14)."""
+SEARCH = (Stage(3.0, 0.3, 10), Stage(1.0, 3.0, 6)) * 4 + (Stage(0.3, 0.3, 8), Stage(0.3, 3.0, 8))
+"""Stages from any start: weights of centre and cones, and steps. Each leads out of places where the other is stuck."""
+TO_CENTRE = (Stage(0.3, 3.0, 8, exact=False),)  # from candidates, most of which are feasible but for rounding
 LEAST_STARTS = 25  # fewest starts at a time under a time budget: with less, the overhead of each step outweighs them
 
 

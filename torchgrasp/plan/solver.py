@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Batch
-from torchgrasp.geometry.linalg import limit_norm
 from torchgrasp.geometry.optim import Damping, Linearisation, Problem, Step, Steps, Verdict, levenberg_marquardt
 from torchgrasp.plan.closure import Vectors
 from torchgrasp.plan.problem import (
@@ -152,7 +151,7 @@ def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[T
     x = points.flatten(0, 1)
     for _ in range(steps):
         distance, gradient = shape.mean_and_gradient(x)
-        x = x + limit_norm(newton_step(distance, gradient, gradient)[:, None] * gradient, LONGEST_STEP)
+        x = x + newton_step(distance, gradient, LONGEST_STEP)
     return x.view_as(points)
 
 

@@ -52,18 +52,11 @@ def chunk_sizes(starts: int) -> list[int]:
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
 
-class Candidates(NamedTuple):
-    """Candidate contacts: normalised points of the surface, with their normals."""
-
-    points: Float[Tensor, "p 3"]
-    normals: Float[Tensor, "p 3"]
-
-
 class Settled(NamedTuple):
-    """A contact specification with a known `flat_radius`, and the candidates on flat surface (None: no flatness)."""
+    """A specification with a known `flat_radius`, and candidates on flat surface with normals (None: no flatness)."""
 
     spec: ContactSpec
-    candidates: Candidates | None
+    candidates: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]] | None
 
 
 def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
@@ -103,7 +96,7 @@ def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
                 break
     if int(flat.sum()) < spec.fingertips:
         flat = torch.ones_like(flat)
-    return Settled(settled, Candidates(points[flat], normals[flat]))
+    return Settled(settled, (points[flat], normals[flat]))
 
 
 def draw(shape: Shape, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator) -> Float[Tensor, "_ f 3"]:

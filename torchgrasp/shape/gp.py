@@ -113,10 +113,9 @@ class ShapeGP(Posterior, Normalisation):
             mean, spread = self.estimate(self._queries(points))
             variance = spread[:, 0, 0]
             std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
-            distance, normal, variance, std_m, covariance = (
-                _reshape(part, points) for part in (mean[:, 0], unit(mean[:, 1:]), variance, std_m, spread)
-            )
-            return distance, normal, variance, std_m
+            parts = mean[:, 0], unit(mean[:, 1:]), variance, std_m, spread
+            *parts, covariance = (_reshape(part, points) for part in parts)
+            return tuple(parts)
 
         def differentiate(points: Tensor) -> tuple[Tensor, ...]:
             slopes = self.differentiate(points)

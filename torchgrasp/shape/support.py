@@ -69,12 +69,9 @@ def paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator)
     center = seen.points.mean(0)
     scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
     sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(center)
-    anchors = off_surface(
-        torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere]),
-        torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])]),
-        noise,
-    )
-    return Support(Normalisation(center, scale), anchors, noise)
+    x = torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere])
+    distance = torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])])
+    return Support(Normalisation(center, scale), off_surface(x, distance, noise), noise)
 
 
 def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
@@ -100,10 +97,8 @@ def camera_support(seen: PreparedCloud, completion: Completion | None, noise: fl
     sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
     x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
     distance = torch.cdist(x, frame.normalise(surface)).amin(1)
-    inner = int(inside)
-    anchors = join(
-        [off_surface(x[:inner], -distance[:inner], noise), off_surface(x[inner:], distance[inner:], OUTER_NOISE)]
-    )
+    inner, outer = off_surface(x[:-OUTER_POINTS], -distance[:-OUTER_POINTS], noise), x[-OUTER_POINTS:]
+    anchors = join([inner, off_surface(outer, distance[-OUTER_POINTS:], OUTER_NOISE)])
     return Support(frame, anchors, NORMAL_NOISE, STD_FACTORS[kind, table is not None], parts, free, kind=kind)
 
 

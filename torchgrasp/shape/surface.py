@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgrasp.base import Value, map_tensors
 from torchgrasp.checks import Range, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.linalg import limit_norm, unit
+from torchgrasp.geometry.linalg import Points, limit_norm, unit
 from torchgrasp.geometry.mesh import clip_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, SignedDistanceField, field_from_surface
 from torchgrasp.shape.gp import ShapeGP
@@ -120,7 +120,7 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
     normals, rows = torch.zeros_like(x), torch.arange(len(x), device=device)
     for _ in range(3):
         value, gradient = shape.mean_and_gradient(x[rows])
-        motion = limit_norm(newton_step(value, gradient, gradient, 1e-12)[:, None] * gradient, step)
+        motion = newton_step(value, gradient, step, 1e-12)
         x[rows], normals[rows] = x[rows] + motion, gradient
         rows = rows[torch.linalg.vector_norm(motion, dim=-1) > 1e-4]
     if others:  # the cut turns triangles around, so they are wound after it
@@ -131,8 +131,7 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
     a, b, c = x[faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)
     outward = (across * normals[faces].sum(1)).sum() > 0
-    faces = faces if bool(outward) else faces.flip(1)
-    return x, faces
+    return x, faces if bool(outward) else faces.flip(1)
 
 
 def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
@@ -164,11 +163,10 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     return values
 
 
-def newton_step(
-    value: Float[Tensor, "n"], gradient: Float[Tensor, "n 3"], direction: Float[Tensor, "n 3"], least_slope: float = 0.0
-) -> Float[Tensor, "n"]:
-    """Return the Newton step to the zero level, as a multiple of `direction`; slopes are at least `least_slope`."""
-    return -value / (gradient * direction).sum(-1).clamp_min(least_slope)
+def newton_step(value: Float[Tensor, "n"], gradient: Points, longest: float, least_slope: float = 0.0) -> Points:
+    """Return the Newton step along the gradient to the zero level, at most `longest`."""
+    step = -value / (gradient * gradient).sum(-1).clamp_min(least_slope)
+    return limit_norm(step[:, None] * gradient, longest)
 
 
 def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:

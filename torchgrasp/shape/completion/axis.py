@@ -50,12 +50,8 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
     points = apply(axis_from_cloud, scorer.points)
     lines = _lines_from_above(points, rotate(axis_from_cloud, scorer.normals))
     origin = torch.zeros(2, dtype=torch.float64)
-    mask = _round_body(
-        points,
-        lines,
-        origin,
-        lambda _, typical: torch.hypot(ROUNDNESS * typical, torch.full_like(typical, ROUND_ERROR)),
-    )
+    error = torch.tensor(ROUND_ERROR, dtype=torch.float64)
+    mask = _round_body(points, lines, origin, lambda _, typical: torch.hypot(ROUNDNESS * typical, error))
     if mask is None:
         return None
     spread = points[mask][farthest_points(points[mask], PROBES, tie=TIE)]
