@@ -222,7 +222,7 @@ class Scene(Value):
                 continue
             found.append(f"objects {a} and {b} touch, and their border is a guess: give a mask of the one to grasp")
         parts = cut_creases(self.image, labels)
-        for k in set(self.things) - set(self.given):
+        for k in (k for k in self.things if k not in self.given):
             sizes = parts[labels == k].unique(return_counts=True)[1]
             if int((sizes > 0.1 * sizes.sum()).sum()) > 1:
                 found.append(f"object {k} has a crease: if it is several objects, give a mask of the one to grasp")
