@@ -92,7 +92,7 @@ def motion(generator: torch.Generator) -> Tensor:
     return rigid(turn, torch.randn(3, generator=generator, dtype=torch.float64))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def seen_cylinder() -> "PointCloud":
     """One side of a standing cylinder, r 30 mm and h 120 mm, seen from a camera 0.5 m away, with exact normals."""
     from torchgrasp.values import PointCloud

@@ -11,23 +11,30 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from scipy.optimize import linprog
 from torch import Tensor
 
+from torchgrasp.base import named_tensors
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
-from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
+from torchgrasp.hand import load
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.closure import closed_exact
 from torchgrasp.posture_model.sample import HandSamples
 from torchgrasp.scene import Scene
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.kernel import Kernel, Profile, cross_covariance
+from torchgrasp.shape.kernel import Kernel, KernelName, Profile, cross_covariance
 from torchgrasp.shape.values import Normalisation, Observations
 from torchgrasp.values import Contacts, PointCloud
 
 ROOT = Path(__file__).parents[1]
+
+
+load_hand = functools.cache(load.load_hand)
+"""Each hand is read once; it keeps its library of postures."""
 
 
 def start_process(command: list[str], **options: Any) -> subprocess.Popen[str]:
@@ -46,6 +53,25 @@ def real(values) -> Tensor:
 def directions(n: int, seed: int = 0) -> Tensor:
     """Random unit vectors (n, 3) in float64."""
     return unit(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+
+
+def random_motion(seed: int) -> Tensor:
+    """A rigid motion far from the identity."""
+    draw = torch.randn(2, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return rigid(rotation_from_vector(2 * draw[0]), 0.5 * draw[1])
+
+
+def distance_field(distance, middle: Tensor, half: float, spacing: float) -> SignedDistanceField:
+    """The field of a distance in closed form, which takes points (n, n, n, 3), around a middle."""
+    axis = torch.arange(-half, half, spacing, dtype=torch.float64)
+    offsets = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return SignedDistanceField(middle - half, spacing, distance(offsets + middle))
+
+
+def spokes(*angles: float) -> Tensor:
+    """Unit vectors (1, f, 3) across z at angles [rad]; by default the corners of a triangle."""
+    turn = real(angles or (0.1, 2.2, 4.3))
+    return torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1)[None]
 
 
 def ball(n: int = 300, radius: float = 0.04, centre=(0.0, 0.0, 0.0), seed: int = 0, viewpoint=None) -> PointCloud:
@@ -168,6 +194,78 @@ def covariance(x: Tensor, other: Tensor, has_normal: Tensor, other_has_normal: T
     blocks = cross_covariance(Kernel(profile), x.detach(), other.detach(), len(other)).flatten(0, 1)
     rows, columns = (torch.cat([torch.ones_like(mask), mask.repeat(3)]) for mask in (has_normal, other_has_normal))
     return blocks[rows][:, columns]
+
+
+def dense_posterior(
+    known: Observations, profile: Profile, x: Tensor, normals: bool = True, extra: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Mean and covariance of (d, w), or of d alone, at points by one dense solve; `extra` is added to the noise."""
+    y, noise = known.rows()
+    has, asked = known.has_normal, torch.full((len(x),), normals)
+    k = covariance(known.x, known.x, has, has, profile) + torch.diag(noise) + (0.0 if extra is None else extra)
+    star, own = covariance(x, known.x, asked, has, profile), covariance(x, x, asked, asked, profile)
+    return star @ torch.linalg.solve(k, y), own - star @ torch.linalg.solve(k, star.T)
+
+
+def half_sphere(n: int = 40, extra: int = 0) -> Observations:
+    """Points of the unit sphere's right half with normals, mixed with points off it without; then `extra` on it."""
+    generator = torch.Generator().manual_seed(3)
+    on = unit(torch.randn(n + extra, 3, dtype=torch.float64, generator=generator))
+    on = torch.cat([on[:, :1].abs(), on[:, 1:]], 1)
+    x = torch.cat([real([[0.0, 0.0, 0.0]]), -1.2 * on[:10], 1.2 * on[:10], on])
+    last = len(x) - extra
+    x = torch.cat([x[torch.randperm(last, generator=generator)], x[last:]])
+    distance = torch.linalg.vector_norm(x, dim=-1) - 1.0
+    on_sphere, noise = distance.abs() < 1e-9, torch.full_like(distance, 0.02)
+    return Observations(x, torch.where(on_sphere, 0.0, distance), x, on_sphere, noise, 2.5 * noise)
+
+
+def fit_half_sphere(
+    known: Observations, kernel: KernelName | Kernel = "thin_plate", std_factor: float = 1.0
+) -> ShapeGP:
+    """The shape of observations of the unit sphere, as a ball of 50 mm at an offset."""
+    frame = Normalisation(real([0.3, -0.2, 0.1]), 0.05)
+    cloud = PointCloud(frame.metres(known.x[known.has_normal]))
+    return condition(known, frame, cloud, std_factor=std_factor, kernel=kernel)
+
+
+def queries(shape: ShapeGP, n: int) -> Tensor:
+    """Points [m] all over a shape's domain."""
+    generator = torch.Generator().manual_seed(7)
+    x = unit(torch.randn(n, 3, dtype=torch.float64, generator=generator))
+    return shape.metres(x * torch.rand(n, 1, dtype=torch.float64, generator=generator) * shape.domain_radius * 0.99)
+
+
+def near(found: Tensor, wanted: Tensor, atol: float) -> None:
+    """Assert that all numbers are within a tolerance of the wanted ones."""
+    torch.testing.assert_close(found, wanted, rtol=0, atol=atol)
+
+
+def same_bits(first: Any, second: Any) -> bool:
+    """Tell whether two values hold the same tensors to the last bit."""
+    a, b = named_tensors(first), named_tensors(second)
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def largest_share(wrenches: np.ndarray) -> float:
+    """The largest s of Eq. (13) by SciPy: phi >= s, sum phi = 1, and phi balances the wrenches (6, m)."""
+    m = wrenches.shape[1]
+    equal = np.r_[np.c_[wrenches, wrenches.sum(1)], [np.r_[np.ones(m), m]]]  # phi = s + psi with psi >= 0
+    bounds = [(0, None)] * m + [(None, None)]
+    found = linprog(np.r_[np.zeros(m), -1.0], A_eq=equal, b_eq=np.eye(7)[6], bounds=bounds)
+    return float(found.x[m]) if found.status == 0 else -np.inf
+
+
+def closure_margin(points: Tensor, normals: Tensor, friction: float, edges: int = 24) -> tuple[float, int]:
+    """The margin of Eq. (13) for contacts (f, 3) by NumPy and SciPy alone, and the rank of their wrenches."""
+    arms, columns = (points - points.mean(0)).numpy(), []
+    turn = 2 * np.pi * np.arange(edges)[:, None] / edges
+    for arm, inward in zip(arms / np.linalg.norm(arms, axis=1).max(), -normals.numpy(), strict=True):
+        one, other = np.linalg.svd(inward[None])[2][1:]
+        force = inward + friction * (np.cos(turn) * one + np.sin(turn) * other)
+        columns.append(np.c_[force, np.cross(arm, force)])
+    wrenches = np.concatenate(columns).T
+    return largest_share(wrenches), int(np.linalg.matrix_rank(wrenches, tol=1e-3))
 
 
 def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -1,6 +1,7 @@
 """A standing cylinder and a pinch of it by each hand, solved once: what tests of trials and simulators start from."""
 
 import dataclasses
+import functools
 import hashlib
 
 import pytest
@@ -42,6 +43,7 @@ def cylinder(shift=(0.0, 0.0)):
     return mesh
 
 
+@functools.cache
 def pinch(name):
     """The hand and its grasp of the cylinder."""
     real = {"dtype": torch.float64}
@@ -71,6 +73,12 @@ def close(name, mesh=None, spec=None, **options):
     pytest.importorskip("sapien")
     hand, grasp = pinch(name)
     return close_hand(grasp, hand, cylinder() if mesh is None else mesh, spec, **options)
+
+
+@functools.cache
+def quick_trial(name="allegro", simulator="sapien"):
+    """The trial of a cylinder that stands where it was planned, simulated once for all tests."""
+    return close(name, spec=dataclasses.replace(QUICK, simulator=simulator))
 
 
 def digest(result):

@@ -1,21 +1,20 @@
 """Three point fingers that slide along x, y and z around a pinched block: what tests of the controllers start from."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import torch
 
+from tests.make import real
 from torchgrasp.closure import ClosingGains
-from torchgrasp.control import ClosingReference, Observation, no_contact
+from torchgrasp.control import ClosingReference, GraspController, Observation, Targets, TipContact, measure, no_contact
 from torchgrasp.control.law import surface_covariance
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.fingers import ActuatedJoints
 from torchgrasp.hand.load import load_hand
 
 PERIOD = 0.01
 FREE, TOUCHING = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)
-
-
-def real(values) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 NORMALS = real([[1, 0, 0], [1, 0, 0], [-1, 0, 0]])
@@ -52,6 +51,27 @@ def reference(coupling: torch.Tensor | None = None) -> ClosingReference:
         normals=NORMALS,
         gains=GAINS,
     )
+
+
+def on_table(**changes) -> ClosingReference:
+    """The reference of an object on a table whose normal is the hand's y axis."""
+    return dataclasses.replace(reference(), **({"table": Plane(real([0, 1, 0]), -0.1)} | changes))
+
+
+def close_on_block(
+    controller: GraspController, seconds: float, off: float = 0.01, away: float = 0.0
+) -> Iterator[tuple[Observation, Targets]]:
+    """Close on a stiff block `away` [m] along x of its place; the joints follow and slide the tips from `off` [m]."""
+    joints, palm, tactile, shift = torch.zeros(9).double(), torch.zeros(3).double(), no_contact(), real([away, 0, 0])
+    for _ in range(round(seconds / PERIOD)):
+        points = TARGET + off * NORMALS + joints.reshape(3, 3)
+        push = 2e3 * -((points + palm - TARGET - shift) * NORMALS).sum(-1).clamp_max(0.0)  # of 2 kN/m
+        contact = TipContact(push, -push[:, None] * NORMALS, points, NORMALS)
+        tactile = measure(tactile, contact, NORMALS, real([0.01] * 3), PERIOD)
+        seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
+        targets = controller.step(seen, PERIOD)
+        joints, palm = targets.joints, targets.palm
+        yield seen, targets
 
 
 def observation(off: float = 0.02, reading=(0.0, 0.0, 0.0), contact=FREE, joints=None) -> Observation:

@@ -7,14 +7,14 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from tests.point_fingers import NORMALS, PERIOD, TARGET, observation, real, reference
+from tests.point_fingers import NORMALS, PERIOD, close_on_block, real, reference
+from torchgrasp import Plane
 from torchgrasp.closure import ClosingOptions
-from torchgrasp.control import GraspController, TipContact, measure, no_contact
+from torchgrasp.control import GraspController
 from torchgrasp.control.law import surface_covariance
 from torchgrasp.control.object_pose import ContactPlanes
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.geometry.plane import Plane
 
 AROUND = unit(real([[1, 0.3, 0.1], [-0.4, 1, 0], [-0.5, -0.9, 0.2]]))
 """Normals that span the plane across z, and a little more."""
@@ -65,34 +65,23 @@ def test_displacement_by_certain_contacts_stays_on_the_table():
     assert float(found[2].abs()) < 1e-6 and float(moved[:, 2].abs().max()) < 1e-4
 
 
-def test_displacement_follows_the_more_certain_of_two_touches():
+def test_displacement_follows_the_more_certain_touch_and_is_bounded_in_the_air():
     opposed = real([[1, 0, 0], [-1, 0, 0], [0, 1, 0]])
     felt = torch.tensor([True, True, False])
     for std_mm, sign in (((1.0, 9.0, 1.0), 1.0), ((9.0, 1.0, 1.0), -1.0)):
         held = known(opposed, std_mm)
         found = ContactPlanes(held).displacement(held.gains.target + 0.008 * opposed, felt)
         assert float(found[0]) * sign > 1e-3
-
-
-def test_displacement_by_a_finger_in_the_air_is_bounded():
     held, touching = known(), torch.tensor([False, False, False])
     near, far = (ContactPlanes(held).displacement(held.gains.target - off * AROUND, touching) for off in (0.025, 0.25))
     assert torch.allclose(near, far)
 
 
-def close(controller: GraspController, away: float, seconds: float = 3.5) -> tuple[torch.Tensor, torch.Tensor]:
-    """Close on a stiff block that stands `away` [m] along x; return the path of palm and joints."""
-    joints, palm, tactile, path = torch.zeros(9).double(), torch.zeros(3).double(), no_contact(), []
-    shift = real([away, 0, 0])
-    for _ in range(round(seconds / PERIOD)):
-        points = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
-        push = 2e3 * -((points + palm - TARGET - shift) * NORMALS).sum(-1).clamp_max(0.0)
-        tactile = measure(
-            tactile, TipContact(push, -push[:, None] * NORMALS, points, NORMALS), NORMALS, real([0.01] * 3), PERIOD
-        )
-        seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
-        joints, palm, _ = controller.step(seen, PERIOD)
-        path.append(torch.cat([palm, joints]))
+def close(controller: GraspController, away: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Close on a block that stands `away` [m] along x; return the path of palm and joints."""
+    path = []
+    for _, targets in close_on_block(controller, 3.5, 0.02, away):
+        path.append(torch.cat([targets.palm, targets.joints]))
         if controller.closing.done:
             break
     palms, angles = torch.stack(path).split([3, 9], 1)
@@ -111,12 +100,9 @@ def test_palm_follows_a_displaced_block(closing):
     assert ((moved[-1] + 0.02 * NORMALS) * NORMALS).sum(-1).abs().max() > 8e-3
 
 
-def test_palm_stays_or_moves_within_its_reach():
+def test_palm_moves_within_its_reach_or_stays():
+    for closing in ("paper", "position", "open_loop"):
+        assert close(GraspController(reference(), closing), 0.01)[0].abs().max() == 0
     assert close(GraspController(reference()), 0.0)[0].norm(dim=-1).max() < 1e-3
     far = close(GraspController(reference()), 0.018)[0].norm(dim=-1)
     assert 0.01 < float(far.max()) <= ClosingOptions().palm_reach + 1e-9
-
-
-@pytest.mark.parametrize("closing", ["paper", "position", "open_loop"])
-def test_palm_stays_under_other_closings(closing):
-    assert close(GraspController(reference(), closing), 0.01)[0].abs().max() == 0

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from torchgrasp import TrialSpec
 from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.controller import CLOSING_TIME, GraspController
 from torchgrasp.control.forces import desired_forces
@@ -13,7 +14,6 @@ from torchgrasp.control.holding import RAMP, ForceHold, held_forces
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.control.recovery import PRESSING_TIME
 from torchgrasp.errors import BadArgument
-from torchgrasp.specs import TrialSpec
 
 PRESSED = (2.0, 2.0, 4.0)
 CLOSE = TARGET * real([1.0, 1.0, 0.2])  # two contacts side by side: unequal forces need little friction
@@ -29,13 +29,10 @@ def off(forces: torch.Tensor, proportions: torch.Tensor) -> float:
     return float((push / push.max() - proportions).norm())
 
 
-def test_desired_forces_balance_or_press_along_the_normals():
+def test_desired_and_held_forces_balance_or_press_along_the_normals():
     torch.testing.assert_close(desired_forces(TARGET, NORMALS, 6.0).sum(0), torch.zeros(3, dtype=torch.float64))
     alike = NORMALS[:1].expand(3, 3).contiguous()
     torch.testing.assert_close(desired_forces(TARGET, alike, 6.0), -6.0 * alike)
-
-
-def test_held_forces_balance_at_the_sensed_contacts():
     forces, total = held_forces(reference(), observation(contact=TOUCHING))
     assert forces.sum(0).abs().max() < 1e-9
     assert torch.linalg.cross(TARGET, forces).sum(0).abs().max() < 1e-9
@@ -46,14 +43,11 @@ def test_held_forces_balance_at_the_sensed_contacts():
     assert total == pytest.approx(8.0)
 
 
-def test_desired_forces_approach_preferred_proportions():
+def test_desired_forces_approach_preferred_proportions_and_held_ones_keep_those_of_the_stability_model():
     preferred = real([0.8, 0.2, 1.0])
     even, led = (desired_forces(CLOSE, NORMALS, 4.0, x) for x in (None, preferred))
     assert led.sum(0).abs().max() < 1e-9
     assert off(led, preferred) < 0.5 * off(even, preferred)
-
-
-def test_held_forces_keep_the_proportions_of_the_stability_model_alone():
     planned, seen = real([3.2, 0.8, 4.0]), observation(contact=TOUCHING)
     seen = dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, points=CLOSE))
     gains = dataclasses.replace(GAINS, desired_force=-planned[:, None] * NORMALS)
@@ -113,30 +107,24 @@ def test_controller_keeps_its_targets_in_the_tick_that_begins_the_holding(holdin
     assert controller.pressed == PERIOD
 
 
-def test_reference_passes_nan_of_a_diverged_simulation():
-    known, lost = reference(), torch.full((9,), torch.nan).double()
-    assert torch.isnan(known.expand(lost)).all() and torch.isnan(known.pick(lost)).all()
-    assert torch.isnan(known.hand.actuated.couple(lost)).all()
-
-
-def test_controller_starts_with_the_opened_hand_and_refuses_unknown_names():
+def test_controller_starts_with_the_opened_hand_refuses_unknown_names_and_passes_nan():
     assert torch.equal(GraspController(reference()).targets.joints, reference().pregrasp)
     for names, match in ((("slow",), "slow"), (("fixed", "glue"), "glue")):
         with pytest.raises((BadArgument, TypeError), match=match):
             GraspController(reference(), *names)
     with pytest.raises(BadArgument, match="law"):
         GraspController(reference(), "position", "law")
+    known, lost = reference(), torch.full((9,), torch.nan).double()
+    assert torch.isnan(known.expand(lost)).all() and torch.isnan(known.pick(lost)).all()
+    assert torch.isnan(known.hand.actuated.couple(lost)).all()
 
 
-@pytest.mark.parametrize("closing", ["paper", "position", "open_loop"])
-def test_controller_and_trial_refuse_options_of_closings_without_any(closing):
-    with pytest.raises(BadArgument, match="options"):
-        GraspController(reference(), closing, options=ClosingOptions())
-    with pytest.raises(BadArgument, match="options"):
-        TrialSpec(closing=closing, options=ClosingOptions())
-
-
-@pytest.mark.parametrize("options", [{"pose_estimate": False}, {"palm_reach": 0.0}, {"attempts": 0}, {"stops": -1}])
-def test_closing_options_refuse_components_without_those_they_need(options):
-    with pytest.raises(BadArgument):
-        ClosingOptions(**options)
+def test_options_of_closings_without_any_and_components_without_those_they_need_are_refused():
+    for closing in ("paper", "position", "open_loop"):
+        with pytest.raises(BadArgument, match="options"):
+            GraspController(reference(), closing, options=ClosingOptions())
+        with pytest.raises(BadArgument, match="options"):
+            TrialSpec(closing=closing, options=ClosingOptions())
+    for options in ({"pose_estimate": False}, {"palm_reach": 0.0}, {"attempts": 0}, {"stops": -1}):
+        with pytest.raises(BadArgument):
+            ClosingOptions(**options)

@@ -1,6 +1,7 @@
 """Grip by the felt load: least forces beside SciPy, what is believed of friction, and a hand that carries a block."""
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -8,11 +9,10 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from torchgrasp import Plane, Status
 from torchgrasp.control.holding import MIN_PUSH, PRIOR_STD, FrictionEstimate, GripHold
 from torchgrasp.control.least_forces import LeastForces, balance, friction_ratios
 from torchgrasp.control.tactile import Observation
-from torchgrasp.errors import Status
-from torchgrasp.geometry.plane import Plane
 
 POINTS, OUTWARD = TARGET.numpy(), NORMALS.numpy()
 GRASP_MAP = balance(POINTS).wrench
@@ -89,8 +89,9 @@ def test_friction_estimate_is_a_gaussian_posterior():
     assert estimate.low < estimate.mean < estimate.high
 
 
+@functools.cache
 def carried(
-    weight: float, friction: float, seconds: float = 4.0, max_force: float | None = None
+    weight: float, friction: float, max_force: float | None = None, seconds: float = 4.0
 ) -> tuple[GripHold, Observation, list[float]]:
     """Hold a block whose weight comes off its table in half a second, after another one, without noise.
 
@@ -124,7 +125,7 @@ def carried(
     return hold, seen, sums
 
 
-def test_grip_carries_a_heavy_block_harder_and_releases_a_light_one():
+def test_grip_carries_heavy_and_slippery_blocks_harder_and_fragile_ones_within_their_force():
     for weight in (0.5, 1.5):
         hold, _, sums = carried(weight, 0.8)
         needed = 4 * weight / 3 / 0.8  # each finger bears a third; the thumb presses as hard as two
@@ -132,33 +133,24 @@ def test_grip_carries_a_heavy_block_harder_and_releases_a_light_one():
         assert needed < sums[-1] < 1.15 * max(needed, 4 * MIN_PUSH)
         assert sums[95] == pytest.approx(8.0, rel=0.2)  # on the table it presses as planned
     assert carried(1.0, 0.8)[0].weight == pytest.approx(1.0, rel=0.05)
-
-
-def test_grip_learns_friction_from_sliding_and_presses_harder():
     slippery, _, hard = carried(2.0, 0.35)
     sticky, _, soft = carried(2.0, 2.0)
     assert slippery.friction.mean < 0.7 and sticky.friction.mean == 0.8
     assert hard[-1] > 1.2 * soft[-1]
+    hold, seen, sums = carried(1.0, 0.8, max_force=2.0)
+    assert hold.status is Status.OK and hold.weight == pytest.approx(1.0, rel=0.05)
+    assert max(sums) < 1.05 * 4.0  # the thumb presses with 2 N, the others with the half
+    assert float(seen.tactile.reading.max()) < 2.0
 
 
-def test_grip_reports_a_load_beyond_the_torques_as_too_heavy():
-    hold, _, _ = carried(40.0, 0.8)
+def test_grip_reports_a_load_as_too_heavy_only_if_a_finger_slides():
+    hold, _, _ = carried(40.0, 0.8)  # beyond the torques
     assert hold.status is Status.TOO_HEAVY and hold.weight > 5.0
-
-
-def test_grip_reports_too_heavy_only_if_a_finger_slides():
     weight, most = 5.0, 2.0
     believed = FrictionEstimate().high * 2 * most  # the thumb presses with 2 N, the others with the half
     assert believed < weight
     assert carried(weight, 3.0, max_force=most)[0].status is Status.OK
     assert carried(weight, 0.8, max_force=most)[0].status is Status.TOO_HEAVY
-
-
-def test_grip_carries_a_fragile_block_within_its_largest_force():
-    hold, seen, sums = carried(1.0, 0.8, max_force=2.0)
-    assert hold.status is Status.OK and hold.weight == pytest.approx(1.0, rel=0.05)
-    assert max(sums) < 1.05 * 4.0  # the thumb presses with 2 N, the others with the half
-    assert float(seen.tactile.reading.max()) < 2.0
 
 
 @pytest.mark.filterwarnings("error")

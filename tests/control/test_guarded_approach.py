@@ -5,17 +5,15 @@ import dataclasses
 import pytest
 import torch
 
-from tests.control.test_localization import CENTER, RADIUS, ball, field
-from tests.point_fingers import PERIOD, observation, real, reference
+from tests.control.test_localization import CENTER, RADIUS, ball_field
+from tests.point_fingers import PERIOD, observation, on_table, real
+from torchgrasp import ClosingReference, GraspController, load_hand
 from torchgrasp.closure import ClosingOptions, SensorModel
-from torchgrasp.control import ClosingReference, GraspController
 from torchgrasp.control.object_pose import FINE_TURNS, TURNS
 from torchgrasp.control.recovery import ACCELERATION, CAREFUL_SPEED, SPEED, GuardedApproach
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.plane import Plane
-from torchgrasp.hand.load import load_hand
 
 ALL = ClosingOptions()
 DOWN, LENGTH, TIP = real([0.0, -1.0, 0.0]), 0.08, 0.01
@@ -24,8 +22,7 @@ OPEN = real([[0.052, 0, 0.02], [0.052, 0, -0.02], [-0.036, 0, 0]])
 
 
 def above(**changes):
-    known = {"table": Plane(real([0, 1, 0]), -0.1), "surface": field(ball), "approach": DOWN}
-    return dataclasses.replace(reference(), **(known | changes))
+    return on_table(**({"surface": ball_field(), "approach": DOWN} | changes))
 
 
 def feel(hand, shift):
@@ -77,9 +74,8 @@ def test_guarded_approach_moves_the_palm_to_the_touched_object(shift):
     assert palms.diff(dim=0).norm(dim=-1).max() <= PALM_SPEED * PERIOD * (1 + 1e-9)
 
 
-def test_guarded_approach_rests_and_draws_back_before_its_palm_moves():
-    shift, hand = real([0.016, 0, 0]), GuardedApproach(above(), ALL, LENGTH)
-    lefts, palms = come(hand, shift)
+def test_guarded_approach_draws_back_before_its_palm_moves_within_its_reach():
+    lefts, palms = come(GuardedApproach(above(), ALL, LENGTH), real([0.016, 0, 0]))
     stopped = int((lefts.diff() == 0).int().argmax())
     rest = lefts[stopped:].eq(lefts[stopped]).int().cumprod(0).sum()
     assert abs(int(rest) * PERIOD - (0.06 + (len(TURNS) + len(FINE_TURNS) + 2) * PERIOD)) <= 2 * PERIOD
@@ -87,29 +83,24 @@ def test_guarded_approach_rests_and_draws_back_before_its_palm_moves():
     assert lefts[first] == pytest.approx(float(lefts[stopped]) + 0.02)
     assert (-lefts[first:].diff()).max() <= CAREFUL_SPEED * PERIOD * (1 + 1e-9)  # it comes slowly then
     assert lefts.max() <= LENGTH
-
-
-def test_guarded_approach_keeps_the_palm_within_its_reach():
     hand = GuardedApproach(above(), ALL, LENGTH)
     for _ in range(500):
         hand(feel(hand, real([0.03, 0, 0])), 4 * PERIOD)
         assert hand.palm.norm() <= ALL.palm_reach * (1 + 1e-9)
 
 
-def test_guarded_approach_continues_after_the_last_stop():
-    hand, everywhere = GuardedApproach(above(), ALL, LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
+@pytest.mark.parametrize("placed", [True, False])
+def test_guarded_approach_arrives_though_every_finger_touches_all_the_way(placed):
+    hand, seen = GuardedApproach(above(), ALL, LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
+    if not placed:
+        nowhere = torch.full((3, 3), torch.nan).double()
+        seen = dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, points=nowhere, normals=nowhere))
     for _ in range(3000):
-        hand(everywhere, PERIOD)
-    assert hand.done and hand.stops == ALL.stops
-
-
-def test_guarded_approach_without_places_moves_no_palm():
-    hand, touching = GuardedApproach(above(), ALL, LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
-    nowhere = torch.full((3, 3), torch.nan).double()
-    tactile = dataclasses.replace(touching.tactile, points=nowhere, normals=nowhere)
-    for _ in range(3000):
-        hand(dataclasses.replace(touching, tactile=tactile), PERIOD)
-    assert hand.done and not hand.palm.any()
+        if hand.done:
+            break
+        hand(seen, PERIOD)
+    assert hand.done
+    assert hand.stops == ALL.stops if placed else not hand.palm.any()
 
 
 def approach(controller, shift):
@@ -151,10 +142,10 @@ def test_controller_refuses_an_approach_that_it_cannot_guard(closing, options, m
     assert not GraspController(held, closing, options=options).approaching
 
 
-@pytest.mark.parametrize("length", ["0.1", float("nan"), -0.1, 1.1, None])
-def test_controller_refuses_a_bad_length_of_approach(length):
-    with pytest.raises(BadArgument, match="approach"):
-        GraspController(above(), approach=length)
+def test_controller_refuses_a_bad_length_of_approach():
+    for length in ("0.1", float("nan"), -0.1, 1.1, None):
+        with pytest.raises(BadArgument, match="approach"):
+            GraspController(above(), approach=length)
 
 
 def test_reference_has_the_approach_in_the_hands_axes():

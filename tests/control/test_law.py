@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.make import directions
+from torchgrasp import ClosingReference, closing_gains, load_hand
 from torchgrasp.control.forces import contacts_in_hand, joint_stiffness, tip_compliance
 from torchgrasp.control.law import (
     FORCE_BANDWIDTH,
@@ -25,20 +27,13 @@ from torchgrasp.control.law import (
     tip_velocity,
 )
 from torchgrasp.control.paper.stability import load_stability
-from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.hand.load import load_hand
 
 
 def draw(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def directions(*shape, seed=0):
-    v = draw(*shape, 3, seed=seed)
-    return v / v.norm(dim=-1, keepdim=True)
 
 
 def shipped(name):
@@ -58,15 +53,10 @@ def test_eq26_blend_is_the_gaussian_of_the_error():
     assert ((share >= 0) & (share <= 1)).all()
     assert torch.equal(blend(torch.zeros(3), torch.eye(3)), torch.tensor(1.0))
 
-
-def test_eq26_tolerates_errors_along_the_normal_more_than_across():
-    normal = torch.tensor([0.0, 0.0, 1.0])
+    normal = torch.tensor([0.0, 0.0, 1.0])  # errors along it are tolerated more than across
     covariance = surface_covariance(normal, torch.tensor(0.015))
     assert blend(0.01 * normal, covariance) > 0.75
     assert blend(torch.tensor([0.01, 0.0, 0.0]), covariance) < 0.2
-
-
-def test_eq26_refuses_an_indefinite_covariance():
     with pytest.raises(IndefiniteCovariance):
         blend(torch.ones(3), torch.diag(torch.tensor([1.0, 1.0, -1.0])))
 
@@ -85,14 +75,11 @@ def test_eq27_gain_is_inverse_to_the_variance_and_bounded_for_axis_normals():
 
 
 @pytest.mark.promise("N14")
-def test_eq28_gain_is_inverse_to_the_force_variance():
+def test_eq28_gain_is_inverse_to_the_force_variance_that_grows_with_the_force():
     covariance = torch.diag_embed(draw(7, 3).abs() + 0.1)
     assert torch.allclose(force_gain(covariance, 0.5), 0.5 / covariance.diagonal(dim1=-2, dim2=-1))
     alpha = torch.linspace(0.1, 1, 7).double()
     assert torch.allclose(force_gain(covariance, alpha)[3], alpha[3] / covariance[3].diagonal())
-
-
-def test_eq28_force_covariance_grows_with_the_force():
     normals = directions(3)
     forces = torch.tensor([3.0, 3.0, 6.0]).double()[:, None] * -normals
     along = torch.einsum("fi,fij,fj->f", normals, force_covariance(forces, normals), normals)
@@ -129,8 +116,8 @@ def test_eq25_damped_inverse_is_the_regularised_least_squares(h):
 @pytest.mark.promise("I12")
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-3, 1.0, 1e3])
 def test_eq25_is_bounded_and_finite_for_any_state(scale):
-    """10^5 states in all: fingers that nothing moves, singular ones, and gains from zero to almost infinite."""
-    n = 20_000
+    """States of fingers that nothing moves, singular ones, and gains from zero to almost infinite."""
+    n = 4000
     jacobian = scale * draw(n, 3, 3, 12, seed=1)
     jacobian[: n // 4, 0] = 0
     jacobian[n // 4 : n // 2, 1] = jacobian[n // 4 : n // 2, 0]
@@ -146,13 +133,19 @@ def test_eq25_is_bounded_and_finite_for_any_state(scale):
     assert step.abs().max() <= MAX_STEP + 1e-12
 
 
-def test_eq25_posture_moves_no_fingertip():
+def test_eq25_posture_moves_no_fingertip_and_compliance_is_the_motion_for_a_newton():
     hand = load_hand("allegro")
     joints = 0.5 * (hand.lower + hand.upper)
     jacobian = hand.jacobian(joints)
     step = joint_step(jacobian, torch.zeros(3, 3).double(), 0.01, posture_error=draw(12), damping=1e-9)
     assert step.norm() > 1e-3
     assert (jacobian @ step).norm() < 1e-3 * step.norm() * jacobian.norm()
+    _, pads = hand.fingertips(joints)
+    for finger in range(3):
+        torque = jacobian[finger].T @ pads[finger]
+        bent = torque / torch.tensor([hand.actuators[n].kp for n in hand.joint_names])
+        moved = (jacobian[finger] @ bent) @ pads[finger]
+        assert float(tip_compliance(jacobian, pads, joint_stiffness(hand))[finger]) == pytest.approx(float(moved))
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -167,13 +160,23 @@ def test_closing_gains_are_in_the_hands_frame(name):
     assert torch.allclose(apply(grasp.obj_from_hand.double(), points[None]), grasp.contacts.points.double(), atol=1e-6)
 
 
-def test_closing_gains_press_unbalanced_contacts_along_their_normals():
+def test_closing_gains_press_unbalanced_contacts_along_their_normals_and_refuse_bad_arguments():
     hand, grasp, *_ = shipped("allegro")
     same = grasp.contacts.normals[:, :1].expand(1, 3, 3).contiguous()
-    grasp = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, normals=same))
-    gains = closing_gains(grasp, hand, 5.0)
+    contacts = grasp.contacts
+    gains = closing_gains(dataclasses.replace(grasp, contacts=dataclasses.replace(contacts, normals=same)), hand, 5.0)
     assert torch.allclose(gains.desired_force, -5.0 * rotate(inverse(grasp.obj_from_hand.double()), same.double())[0])
     assert torch.isfinite(gains.force_gain).all()
+    with pytest.raises(BadArgument, match=r"grasp: expected .*got 0 rows"):
+        closing_gains(grasp[:0], hand)
+    with pytest.raises(BadArgument, match=r"grasps: expected .*got 12 joints"):
+        closing_gains(dataclasses.replace(grasp, meta={}), load_hand("barrett"))
+    for std_m, found in ((contacts.std_m * float("inf"), "inf"), (None, "None")):
+        with pytest.raises(BadArgument, match=rf"std_m: expected .*got {found}"):
+            closing_gains(dataclasses.replace(grasp, contacts=dataclasses.replace(contacts, std_m=std_m)), hand)
+    for force in (0.0, -1.0, float("nan")):
+        with pytest.raises(BadArgument, match="force"):
+            closing_gains(grasp, hand, force)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -197,31 +200,3 @@ def test_reference_approaches_the_forces_that_the_stability_model_prefers():
     even, led = (ClosingReference.from_grasp(hand, grasp, 4.0, stability=x).gains.desired_force for x in (None, model))
     even, led = (float((-(x * normals).sum(-1) - wanted).norm()) for x in (even, led))
     assert led < 0.9 * even
-
-
-def test_tip_compliance_is_the_motion_for_a_newton():
-    """Allegro's joints are driven one by one: pushing with 1 N moves the tip by n.J K^-1 J^T n."""
-    hand = load_hand("allegro")
-    joints = 0.5 * (hand.lower + hand.upper)
-    _, pads = hand.fingertips(joints)
-    jacobian = hand.jacobian(joints)
-    for finger in range(3):
-        torque = jacobian[finger].T @ pads[finger]
-        bent = torque / torch.tensor([hand.actuators[n].kp for n in hand.joint_names])
-        moved = (jacobian[finger] @ bent) @ pads[finger]
-        assert float(tip_compliance(jacobian, pads, joint_stiffness(hand))[finger]) == pytest.approx(float(moved))
-
-
-def test_closing_gains_refuse_bad_arguments():
-    hand, grasp, *_ = shipped("allegro")
-    with pytest.raises(BadArgument, match=r"grasp: expected .*got 0 rows"):
-        closing_gains(grasp[:0], hand)
-    with pytest.raises(BadArgument, match=r"grasps: expected .*got 12 joints"):
-        closing_gains(dataclasses.replace(grasp, meta={}), load_hand("barrett"))
-    contacts = grasp.contacts
-    for std_m, found in ((contacts.std_m * float("inf"), "inf"), (None, "None")):
-        with pytest.raises(BadArgument, match=rf"std_m: expected .*got {found}"):
-            closing_gains(dataclasses.replace(grasp, contacts=dataclasses.replace(contacts, std_m=std_m)), hand)
-    for force in (0.0, -1.0, float("nan")):
-        with pytest.raises(BadArgument, match="force"):
-            closing_gains(grasp, hand, force)

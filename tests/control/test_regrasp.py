@@ -5,24 +5,28 @@ import dataclasses
 import pytest
 import torch
 
-from tests.control.test_uncertainty_closing import press
-from tests.point_fingers import NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from tests.point_fingers import (
+    NORMALS,
+    PERIOD,
+    TARGET,
+    TOUCHING,
+    close_on_block,
+    observation,
+    on_table,
+    real,
+    reference,
+)
+from torchgrasp import GraspController
 from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
-from torchgrasp.control import GraspController
 from torchgrasp.control.controller import CLOSING_TIME
 from torchgrasp.control.recovery import MISPLACED, OPENING_TIME, PRESSING_TIME, GraspCheck, Reopening
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
-from torchgrasp.geometry.plane import Plane
 
 STILL, PLACE = torch.zeros(3).double(), torch.zeros(6).double()
 
 
-def known(**changes):
-    return dataclasses.replace(reference(), table=Plane(real([0, 1, 0]), -0.1), **changes)
-
-
 def judge(seen, believed=PLACE, last=False, reference=None) -> GraspCheck:
-    check = GraspCheck(known() if reference is None else reference, believed, STILL, last)
+    check = GraspCheck(on_table() if reference is None else reference, believed, STILL, last)
     for k in range(60):
         check(seen, k * PERIOD)
     return check
@@ -33,17 +37,10 @@ def pressing(contact=TOUCHING, **changes):
     return dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, **changes))
 
 
-def test_grasp_check_accepts_balanced_contacts():
-    check = judge(pressing())
-    assert check.judged and check.secure
-
-
-@pytest.mark.parametrize("missing", [0, 1, 2])
-def test_grasp_check_rejects_a_finger_in_the_air(missing):
-    contact = TOUCHING.clone()
-    contact[missing] = False
-    check = judge(pressing(contact))
-    assert check.judged and not check.secure
+def test_grasp_check_accepts_balanced_contacts_and_rejects_a_finger_in_the_air():
+    for missing in (None, 0, 1, 2):
+        check = judge(pressing(TOUCHING if missing is None else torch.arange(3) != missing))
+        assert check.judged and check.secure is (missing is None)
 
 
 @pytest.mark.parametrize(("degrees", "secure"), [(25.0, True), (36.0, False)])
@@ -59,15 +56,11 @@ def test_grasp_check_rejects_a_misplaced_object(off, secure):
     assert judge(pressing(), torch.cat([real([0, 0, off]), STILL])).secure is secure
 
 
-def test_grasp_check_accepts_the_last_attempt():
-    check = judge(pressing(torch.zeros(3, dtype=torch.bool)), last=True)
-    assert check.judged and check.secure
-
-
-def test_grasp_check_without_places_judges_by_touch():
+def test_grasp_check_without_places_judges_by_touch_and_accepts_the_last_attempt():
+    assert judge(pressing(torch.zeros(3, dtype=torch.bool)), last=True).secure
     nowhere = torch.full((3, 3), torch.nan).double()
     assert judge(pressing(points=nowhere, normals=nowhere)).secure
-    dead = known()
+    dead = on_table()
     dead = dataclasses.replace(dead, sensor=SensorModel(dead=(dead.hand.finger_names[2],)))
     contact = torch.tensor([True, True, False])
     assert judge(pressing(contact), reference=dead).secure
@@ -76,7 +69,7 @@ def test_grasp_check_without_places_judges_by_touch():
 
 def test_reopening_opens_before_the_palm_moves():
     start, shift = torch.full((9,), 0.1).double(), real([0.01, 0.005, -0.01])
-    opening = Reopening(known(), torch.cat([shift, STILL]), start, STILL, 0.02)
+    opening = Reopening(on_table(), torch.cat([shift, STILL]), start, STILL, 0.02)
     goal, palms, ticks = shift * real([1, 0, 1]), [STILL], 0  # along the table
     while not opening.done:
         joints, ticks = opening(PERIOD), ticks + 1
@@ -91,7 +84,7 @@ def test_reopening_opens_before_the_palm_moves():
 
 @pytest.mark.parametrize(("reach", "length"), [(0.02, 0.02), (0.0, 0.0)])
 def test_reopening_keeps_the_palm_within_its_reach(reach, length):
-    opening = Reopening(known(), torch.cat([real([0.03, 0, 0.04]), STILL]), torch.zeros(9).double(), STILL, reach)
+    opening = Reopening(on_table(), torch.cat([real([0.03, 0, 0.04]), STILL]), torch.zeros(9).double(), STILL, reach)
     while not opening.done:
         opening(PERIOD)
     assert abs(float(opening.palm.norm()) - length) < 1e-12
@@ -108,7 +101,7 @@ def close(controller: GraspController, seen) -> int:
 
 @pytest.mark.parametrize("closing", ["uncertainty", "fixed"])
 def test_controller_closes_again_after_meeting_nothing(closing):
-    controller = GraspController(known(), closing)
+    controller = GraspController(on_table(), closing)
     ticks = close(controller, observation(0.02))
     assert controller.attempts == ClosingOptions().attempts
     assert ticks * PERIOD < 2 * (CLOSING_TIME + PRESSING_TIME) + OPENING_TIME + 0.02 / PALM_SPEED + 0.3
@@ -120,21 +113,19 @@ def test_controller_closes_again_after_meeting_nothing(closing):
      ("position", None, True), ("paper", None, True)],
 )  # fmt: skip
 def test_controller_with_one_attempt_or_without_table_closes_once(closing, options, table):
-    held = known() if table else reference()
+    held = on_table() if table else reference()
     controller = GraspController(held, closing, options=options)
     for _ in range(240):
         controller.step(observation(0.02), 0.05)
     assert controller.attempts == 1 and controller.reopening is None
 
 
-def test_controller_accepts_a_good_grasp_at_once():
-    controller = GraspController(known())
-    press(controller, 3.0)
+def test_controller_accepts_a_good_grasp_at_once_and_expects_the_object_where_it_was_found():
+    controller = GraspController(on_table())
+    for _ in close_on_block(controller, 3.0):
+        pass
     assert controller.closed and controller.attempts == 1
-
-
-def test_controller_expects_the_object_where_it_was_found():
-    controller = GraspController(known())
+    controller = GraspController(on_table())
     while controller.reopening is None:
         controller.step(observation(0.02), PERIOD)
     found = controller.reopening.displacement

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from torchgrasp import TrialSpec
 from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
 from torchgrasp.control import FingertipSensor, GraspController, TipContact, feel_flags, feel_torques, no_contact
 from torchgrasp.control.holding import MAX_FACTOR, ForceHold
 from torchgrasp.control.sensing import TORQUE_NOISE, WAITING_FORCE, DriveFeel
 from torchgrasp.control.uncertainty_closing import STALLED, UncertaintyClosing
 from torchgrasp.errors import BadArgument
-from torchgrasp.specs import TrialSpec
 
 WAIT_ALONE = dataclasses.replace(NO_OPTIONS, wait=True)
 JACOBIAN = torch.eye(9).double().reshape(3, 3, 9)
@@ -35,7 +35,7 @@ def told(known, force, ticks=100, seed=None):
     return [sensor(touch(force), JACOBIAN, PERIOD) for _ in range(ticks)]
 
 
-def test_sensor_delay_repeats_earlier_readings():
+def test_sensor_delay_repeats_earlier_readings_and_noise_scales():
     fresh = told(having(), (1.0, 2.0, 3.0))
     for late in (1, 4):
         old = told(having(delay=late / 100), (1.0, 2.0, 3.0))
@@ -43,34 +43,33 @@ def test_sensor_delay_repeats_earlier_readings():
             assert torch.equal(old[k].reading, fresh[k - late].reading)
             assert torch.equal(old[k].contact, fresh[k - late].contact)
     assert (old[0].reading == 0).all()
-
-
-def test_sensor_noise_scales():
     one, three = (torch.stack([t.reading for t in told(having(noise=n), (2.0, 2.0, 2.0), 100, 1)]) for n in (1.0, 3.0))
     clean = torch.stack([t.reading for t in told(having(), (2.0, 2.0, 2.0), 100)])
     assert torch.allclose(three - clean, 3 * (one - clean), atol=1e-12)
-
-
-def test_torque_sensor_measures_forces_without_places():
-    last = told(having(kind="torque"), (1.0, 2.0, 0.0))[-1]
-    assert torch.allclose(last.reading, real([1.0, 2.0, 0.0]), rtol=1e-3)
-    assert torch.allclose(last.forces, -last.reading[:, None] * NORMALS, atol=1e-9)
-    assert last.contact.tolist() == [True, True, False]
-    assert not torch.isfinite(last.points).any() and not torch.isfinite(last.normals).any()
-
-
-def test_torque_sensor_noise_is_that_of_unit_levers():
     readings = torch.stack([t.reading for t in told(having(kind="torque"), (2.0, 2.0, 2.0), 700, 1)[50:]])
     passed = math.sqrt(1 - math.exp(-0.4 * math.pi)) / math.sqrt(1 + math.exp(-0.4 * math.pi))  # of an AR(1) low-pass
     assert float(readings.std()) == pytest.approx(TORQUE_NOISE * passed, rel=0.15)
 
 
-def test_feel_torques_equals_the_simulated_sensor():
+def test_torque_sensor_measures_observable_forces_without_places_as_feel_torques_does():
+    last = told(having(kind="torque"), (1.0, 2.0, 0.0))[-1]
+    assert torch.allclose(last.reading, real([1.0, 2.0, 0.0]), rtol=1e-3)
+    assert torch.allclose(last.forces, -last.reading[:, None] * NORMALS, atol=1e-9)
+    assert last.contact.tolist() == [True, True, False]
+    assert not torch.isfinite(last.points).any() and not torch.isfinite(last.normals).any()
     known, tactile = having(kind="torque"), no_contact()
     torques = torch.einsum("fcj,fc->j", JACOBIAN, touch((1.0, 2.0, 0.5)).forces)
     for expected in told(known, (1.0, 2.0, 0.5), 20):
         tactile = feel_torques(tactile, known, JACOBIAN, torques, PERIOD)
         assert torch.allclose(tactile.reading, expected.reading) and torch.equal(tactile.contact, expected.contact)
+    stretched = JACOBIAN.clone()
+    stretched[0, 0] *= 1e-3  # the first finger is stretched out along its normal
+    torques, tactile = 0.01 * torch.ones(9).double(), no_contact()
+    for _ in range(20):
+        tactile = feel_torques(tactile, known, stretched, torques, PERIOD)
+    assert abs(float(tactile.reading[0])) < 1.0  # by least squares it would be 10 N
+    assert tactile.reading[1:].tolist() == pytest.approx([0.0, 0.01], rel=1e-3)
+    assert abs(float(tactile.forces[1, 1]) - 0.01) < 1e-4
 
 
 def test_binary_sensor_reads_the_same_for_every_force():
@@ -101,23 +100,20 @@ def closes(sensor: SensorModel, contact, off: float, ticks=12) -> tuple[Uncertai
 DEAD, TWO = SensorModel(dead=FINGERS[2:]), torch.tensor([True, True, False])
 
 
-def test_dead_finger_rests_at_its_contact_then_searches():
+def test_dead_finger_rests_at_its_contact_then_searches_and_counts_as_touching_far_beyond():
     alone = torch.tensor([True, False, False])
     for contact, off, comes_on in ((alone, 0.01, True), (alone, -0.001, False), (TWO, -0.001, True)):
         law, steps = closes(DEAD, contact, off)
         assert (float(steps[-1]) > 1e-3) == comes_on and not law.done
         if not comes_on:
             assert torch.allclose(steps, steps[:1], atol=1e-9)
-
-
-def test_dead_finger_counts_as_touching_far_beyond_its_contact():
     deviation = float((NORMALS[2] @ GAINS.covariance[2] @ NORMALS[2]).sqrt())
     for off, done in ((-0.9 * 3.0 * deviation, False), (-1.1 * 3.0 * deviation, True)):
         assert closes(DEAD, TWO, off)[0].done == done
     assert not closes(SensorModel(), TWO, -1.1 * 3.0 * deviation)[0].done  # one that could tell searches on
 
 
-def test_dead_finger_stops_where_its_drives_push():
+def test_dead_finger_stops_where_its_drives_push_which_measure_blocked_joints_but_not_motion():
     joints = torch.zeros(9).double()  # something keeps it where it is
     known = dataclasses.replace(reference(), kp=torch.full((9,), 100.0).double(), sensor=DEAD)
     law, seen = UncertaintyClosing(known, WAIT_ALONE), observation(-0.001, (0.3, 0.3, 0.0), TWO, joints)
@@ -126,9 +122,6 @@ def test_dead_finger_stops_where_its_drives_push():
     assert law.done and bool(law.touched.all())
     assert STALLED < 100.0 * float(ahead[-1]) < 3 * STALLED  # it stands, the lag of the average later
     assert torch.allclose(ahead[-20:], ahead[-1:], atol=1e-9)
-
-
-def test_drive_feel_measures_blocked_joints_but_not_motion():
     known, still = reference(), torch.zeros(9).double()
     drive = next(iter(known.hand.actuators.values()))
     pushed, moving = DriveFeel(known), DriveFeel(known)
@@ -195,15 +188,3 @@ def test_sensor_noise_alone_is_no_touch(changes):
     sensor = FingertipSensor(having(**changes), torch.Generator().manual_seed(2))
     reports = [sensor(touch((0.0, 0.0, 0.0)), levers, PERIOD) for _ in range(300)]
     assert not torch.stack([t.contact for t in reports]).any()
-
-
-def test_torque_sensor_suppresses_unobservable_forces():
-    stretched = JACOBIAN.clone()
-    stretched[0, 0] *= 1e-3  # the first finger is stretched out along its normal
-    torques = 0.01 * torch.ones(9).double()
-    known, tactile = having(kind="torque"), no_contact()
-    for _ in range(20):
-        tactile = feel_torques(tactile, known, stretched, torques, PERIOD)
-    assert abs(float(tactile.reading[0])) < 1.0  # by least squares it would be 10 N
-    assert tactile.reading[1:].tolist() == pytest.approx([0.0, 0.01], rel=1e-3)
-    assert abs(float(tactile.forces[1, 1]) - 0.01) < 1e-4

@@ -35,6 +35,7 @@ def run(forces, period=0.01, seed=None, air=(), batch=()):
 
 @pytest.mark.parametrize("period", [0.01, 0.02])
 def test_measure_lags_by_a_first_order_filter_at_any_rate(period):
+    assert low_pass(1e9, period) == 1.0 and 0 < low_pass(1e-3, period) < 2e-4
     for k, touch in enumerate(run([1.0] * 25, period)):
         expected = 1 - math.exp(-2 * math.pi * 20.0 * (k + 1) * period)
         assert abs(float(touch.reading[0]) - expected) < 1e-9
@@ -50,10 +51,13 @@ def test_measure_samples_at_the_sensors_rate_and_holds_the_samples():
     assert fresh == pytest.approx(100 * 0.004 * SAMPLING_RATE, abs=1.5)
 
 
-def test_measure_without_noise_reads_the_truth():
+def test_measure_without_noise_reads_the_truth_and_no_place_of_a_tip_in_the_air():
     touch, truth = run([3.0] * 50)[-1], press(3.0)
     assert torch.allclose(touch.reading, truth.normal_force) and torch.allclose(touch.forces, truth.forces)
     assert torch.equal(touch.points, truth.points) and torch.equal(touch.normals, truth.normals)
+    touch = run([0.0] * 50, seed=2, air=(1,))[-1]
+    assert torch.isnan(touch.points[1]).all() and torch.isnan(touch.normals[1]).all()
+    assert torch.isfinite(touch.points[[0, 2]]).all() and torch.isfinite(touch.forces).all()
 
 
 def test_measure_noise_of_forces_has_the_papers_size_and_no_bias():
@@ -80,25 +84,12 @@ def test_measure_noise_of_a_place_is_along_the_tip_and_turns_its_normal():
     assert torch.allclose(angle, torch.full((3,), 2**0.5 * 1.5e-3 / 0.012).double(), rtol=0.05)
 
 
-def test_measure_reports_no_place_of_a_tip_in_the_air():
-    touch = run([0.0] * 50, seed=2, air=(1,))[-1]
-    assert torch.isnan(touch.points[1]).all() and torch.isnan(touch.normals[1]).all()
-    assert torch.isfinite(touch.points[[0, 2]]).all() and torch.isfinite(touch.forces).all()
-
-
-def test_contact_flag_has_hysteresis_and_ignores_noise():
+def test_contact_flag_has_hysteresis_and_measure_repeats_itself_by_seed():
     flags = [bool(t.contact[0]) for t in run([0.15] * 60 + [0.3] * 60 + [0.15] * 60 + [0.05] * 60)]
     assert not any(flags[:60]) and all(flags[119:180]) and not flags[-1]
     assert not any(bool(t.contact.any()) for t in run([0.0] * 60, seed=3, air=(0, 1, 2), batch=(50,)))
-
-
-def test_measure_repeats_itself_by_seed_and_leaves_the_global_state():
     before = torch.random.get_rng_state()
     first, second, other = (run([1.0] * 5, seed=s)[-1] for s in (7, 7, 8))
     assert torch.equal(first.reading, second.reading) and torch.equal(first.points, second.points)
     assert not torch.equal(first.reading, other.reading)
     assert torch.equal(before, torch.random.get_rng_state())
-
-
-def test_low_pass_is_a_share():
-    assert low_pass(1e9, 0.01) == 1.0 and 0 < low_pass(1e-3, 0.01) < 1e-4

@@ -6,20 +6,28 @@ import numpy as np
 import pytest
 import torch
 
-from tests.point_fingers import FREE, GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from tests.point_fingers import (
+    FREE,
+    GAINS,
+    NORMALS,
+    PERIOD,
+    TARGET,
+    TOUCHING,
+    close_on_block,
+    observation,
+    real,
+    reference,
+)
+from torchgrasp import Plane
 from torchgrasp.closure import NO_OPTIONS, ClosingOptions
-from torchgrasp.control import ClosingReference, GraspController, TipContact, measure, no_contact
+from torchgrasp.control import ClosingReference, GraspController, Observation
 from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, position_gain, surface_covariance
 from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing, PositionClosing
 from torchgrasp.control.sensing import WAITING_FORCE
-from torchgrasp.control.tactile import Observation
 from torchgrasp.control.uncertainty_closing import LEAD, PATIENCE, QUICK_TOUCH, UncertaintyClosing, with_equal_gains
-from torchgrasp.geometry.plane import Plane
 
 ONE, TWO = torch.tensor([True, False, False]), torch.tensor([True, True, False])
 RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0)
-SPRING = 2e3
-"""Stiffness of the block [N/m]."""
 
 
 def closing(options: ClosingOptions = ClosingOptions()) -> UncertaintyClosing:  # noqa: B008, it is frozen
@@ -39,35 +47,30 @@ def uncertain(*std_mm: float, force: float = 1e-3) -> ClosingReference:
     return dataclasses.replace(reference(), gains=gains)
 
 
-def press(controller: GraspController, seconds: float, until=lambda seen: False) -> list[Observation]:
-    """Close on a block that stands where it was planned; the joints follow and slide the tips."""
-    joints, tactile, path = torch.zeros(9).double(), no_contact(), []
-    for _ in range(round(seconds / PERIOD)):
-        points = TARGET + 0.01 * NORMALS + joints.reshape(3, 3)
-        push = SPRING * -((points + controller.targets.palm - TARGET) * NORMALS).sum(-1).clamp_max(0.0)
-        contact = TipContact(push, -push[:, None] * NORMALS, points, NORMALS)
-        tactile = measure(tactile, contact, NORMALS, real([0.01] * 3), PERIOD)
-        seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
-        path.append(seen)
-        if until(seen):
-            break
-        joints = controller.step(seen, PERIOD).joints
-    return path
-
-
 def order(controller: GraspController) -> list[int]:
     """The fingers by their first touch, within the longest time of a closing."""
-    path = press(controller, 3.9, lambda seen: bool((seen.tactile.lagged[:, 0] > 0).all()))
-    forces = torch.stack([seen.tactile.lagged[:, 0] for seen in path])
-    assert (forces[-1] > 0).all()
-    return (forces > 0).double().argmax(0).argsort().tolist()
+    forces = []
+    for seen, _ in close_on_block(controller, 3.9):
+        forces.append(seen.tactile.lagged[:, 0])
+        if bool((forces[-1] > 0).all()):
+            return (torch.stack(forces) > 0).double().argmax(0).argsort().tolist()
+    raise AssertionError("a finger never touched")
 
 
-def test_eq25_free_fingers_approach_their_contacts():
+def test_eq25_free_fingers_approach_their_contacts_at_one_pace_and_fixed_gains_are_certain():
     step = closing()(observation(), PERIOD).reshape(3, 3)
     assert ((step * NORMALS).sum(-1) < 0).all()
     assert step.norm(dim=-1).max() <= MAX_SPEED * PERIOD + 1e-12
     assert step[:, 1:].abs().max() < 1e-9
+    near = dataclasses.replace(observation(0.2), tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS)
+    speed = -(closing()(near, PERIOD).reshape(3, 3) * NORMALS).sum(-1)
+    assert float(speed[1] / speed[0]) == pytest.approx((0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3)
+    assert float(speed[2]) == pytest.approx(float(speed[0]))
+    gains = with_equal_gains(reference()).gains
+    assert torch.allclose(gains.position_gain, real(POSITION_RATE))
+    assert torch.allclose(gains.covariance, POSITION_FLOOR**2 * torch.eye(3).double())
+    assert (gains.force_gain == gains.force_gain[:, :1]).all()
+    assert torch.equal(gains.target, GAINS.target)
 
 
 @pytest.mark.parametrize("contact", [False, True])
@@ -87,12 +90,9 @@ def test_eq25_of_the_paper_by_matrices(contact):
     assert np.allclose(found, PERIOD * bracket * min(1.0, MAX_SPEED / fastest), rtol=1e-4)
 
 
-@pytest.mark.parametrize("std_mm", [(1.0, 5.0, 10.0), (5.0, 10.0, 1.0)])
-def test_paper_closing_touches_with_the_most_certain_finger_first(std_mm):
-    assert order(GraspController(uncertain(*std_mm), "paper")) == np.argsort(std_mm).tolist()
-
-
-def test_paper_closing_touches_with_an_uncertain_finger_first_if_the_force_loop_is_fast():
+def test_paper_closing_touches_with_the_most_certain_finger_first_unless_the_force_loop_is_fast():
+    for std_mm in ((1.0, 5.0, 10.0), (5.0, 10.0, 1.0)):
+        assert order(GraspController(uncertain(*std_mm), "paper")) == np.argsort(std_mm).tolist()
     assert order(GraspController(uncertain(1, 5, 10, force=0.02), "paper"))[0] == 2
 
 
@@ -112,21 +112,6 @@ def test_paper_closing_ends_when_fingers_have_arrived_with_steady_forces():
     near, short = (observation(x, contact=TOUCHING) for x in (0.006, 0.009))  # lambda is 0.64 and 0.37
     assert ticks(seen=near) < ticks(seen=short) == 30
     assert ticks(seen=far) == ticks(seen=there, rising=0.05) == ticks(seen=observation(0.0)) == 30
-
-
-def test_fixed_gains_are_those_of_contacts_without_uncertainty():
-    gains = with_equal_gains(reference()).gains
-    assert torch.allclose(gains.position_gain, real(POSITION_RATE))
-    assert torch.allclose(gains.covariance, POSITION_FLOOR**2 * torch.eye(3).double())
-    assert (gains.force_gain == gains.force_gain[:, :1]).all()
-    assert torch.equal(gains.target, GAINS.target)
-
-
-def test_closing_lets_fingers_in_the_air_keep_pace():
-    near = dataclasses.replace(observation(0.2), tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS)
-    speed = -(closing()(near, PERIOD).reshape(3, 3) * NORMALS).sum(-1)
-    assert float(speed[1] / speed[0]) == pytest.approx((0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3)
-    assert float(speed[2]) == pytest.approx(float(speed[0]))
 
 
 def test_waiting_finger_rests_and_yields_to_more_than_the_waiting_force():
@@ -155,16 +140,13 @@ def test_closing_ends_when_all_touch_or_patience_is_over(contact, time):
         law(observation(contact=contact), PERIOD)
         ticks += 1
     assert ticks * PERIOD == pytest.approx(time, abs=1.5 * PERIOD)
-
-
-def test_closing_does_not_end_before_a_touch():
-    law = closing()
+    untouched = closing()
     for _ in range(100):
-        law(observation(), 2 * PATIENCE / 100)
-    assert not law.done
+        untouched(observation(), 2 * PATIENCE / 100)
+    assert not untouched.done
 
 
-def test_targets_stay_near_the_joints_and_within_their_limits():
+def test_targets_stay_near_the_joints_but_late_fingers_search_and_press_harder():
     law, stopping = closing(), PositionClosing(reference())
     for _ in range(150):
         targets = law(observation(0.5), PERIOD)
@@ -172,9 +154,6 @@ def test_targets_stay_near_the_joints_and_within_their_limits():
     for _ in range(60):
         targets = stopping(observation(0.5), 0.5)
     assert targets.abs().max() == pytest.approx(1.0)
-
-
-def test_late_finger_searches_beyond_its_planned_contact_and_presses_harder():
     seen, law = observation(-0.03, (0.3, 0.3, 0.0), TWO), closing()
     first = law(seen, PERIOD).reshape(3, 3)
     assert float(first[2] @ NORMALS[2]) < -0.5 * MAX_SPEED * PERIOD
@@ -201,16 +180,13 @@ def test_searching_finger_stays_above_the_table(up):
     assert float(tips["low"][~above].min()) > float(-0.03 + 0.01)
 
 
-def test_touching_finger_is_force_controlled_whatever_its_position_error():
+def test_touching_finger_is_force_controlled_and_held_with_the_desired_forces():
     seen = observation(0.03, (2.0, 2.0, 4.0), TOUCHING)  # the forces are as desired, the contacts 30 mm early
     assert UncertaintyClosing(reference(), NO_OPTIONS)(seen, PERIOD).abs().max() < 1e-9
     going = PaperClosing(reference())(seen, PERIOD).reshape(3, 3)
     assert ((going * NORMALS).sum(-1) < -1e-4).all()
-
-
-def test_holding_law_presses_with_the_desired_forces():
     controller = GraspController(uncertain(2, 2, 2, force=0.005), holding="law")
-    last = press(controller, 2.5)[-1]
+    *_, (last, _) = close_on_block(controller, 2.5)
     assert controller.hold is controller.closing
     assert torch.allclose(last.tactile.reading, real([3.0] * 3), rtol=0.05)
 
@@ -229,13 +205,10 @@ def test_position_closing_stops_each_finger_for_good():
     assert law.done
 
 
-def test_position_closing_stops_at_the_papers_force():
+def test_paper_position_closing_aims_at_the_contacts_and_stops_at_the_papers_force():
     law = PositionClosing(reference())
     step = law(observation(0.02, (0.45, 0.55, 0.0)), PERIOD).reshape(3, 3).abs().amax(-1)  # Sec. 6.5: 0.5 N
     assert (step > 0).tolist() == [True, False, True]
-
-
-def test_paper_position_closing_aims_at_the_contacts():
     controller = GraspController(reference(), "paper_position")
     assert isinstance(controller.closing, PositionClosing)
     assert torch.equal(controller.closing.aim, TARGET)

@@ -41,10 +41,19 @@ def test_paired_differences_and_contrasts_have_the_quantiles_of_every_resample()
     assert [third.low, third.high] == pytest.approx(exact([some, other, some], [0.5, -2.0, 0.25]), abs=0.05)
 
 
-def test_equal_columns_differ_by_nothing_and_the_order_of_units_does_not_matter() -> None:
+def test_equal_columns_differ_by_nothing_one_unit_has_no_interval_and_means_of_zeros_and_ones_are_shares() -> None:
     assert difference_over(COUNTS, COUNTS)[:3] == (0.0, 0.0, 0.0)
     assert share_over(dict(reversed(COUNTS.items()))) == share_over(COUNTS)
     assert share_over(COUNTS | {"none": (0, 0)}) == share_over(COUNTS)
+    one = share_over({"tin": (3, 4)})
+    assert one.value == 0.75 and math.isnan(one.low) and math.isnan(one.high) and one.units == 1
+    assert all(math.isnan(x) for x in share_over({})[:3])
+    lacking = difference_over(COUNTS, {"tin": (1, 2)})  # resamples without the tin say nothing of the second
+    assert lacking.low < lacking.value < lacking.high
+    values = [(name, float(k < passed)) for name, (passed, total) in COUNTS.items() for k in range(total)]
+    assert mean_over(values) == contrast_over([COUNTS], [1.0])
+    assert mean_over([*values, ("tin", math.nan)]) == mean_over(values)
+    assert math.isnan(mean_over([("tin", math.nan)]).value)
 
 
 def test_what_ended_alike_everywhere_has_the_bound_of_as_many_trials_as_there_are_units() -> None:
@@ -55,18 +64,3 @@ def test_what_ended_alike_everywhere_has_the_bound_of_as_many_trials_as_there_ar
         assert passed[:3] == (1.0, pytest.approx(low), 1.0)
         failed = share_over({str(k): (0, 5) for k in range(n)})
         assert failed[:3] == (0.0, 0.0, pytest.approx(1 - low))
-
-
-def test_one_unit_has_no_interval_and_nothing_measured_no_share() -> None:
-    one = share_over({"tin": (3, 4)})
-    assert one.value == 0.75 and math.isnan(one.low) and math.isnan(one.high) and one.units == 1
-    assert all(math.isnan(x) for x in share_over({})[:3])
-    lacking = difference_over(COUNTS, {"tin": (1, 2)})  # resamples without the tin say nothing of the second
-    assert lacking.low < lacking.value < lacking.high
-
-
-def test_a_mean_of_zeros_and_ones_is_a_share_and_numbers_that_were_not_measured_count_nowhere() -> None:
-    values = [(name, float(k < passed)) for name, (passed, total) in COUNTS.items() for k in range(total)]
-    assert mean_over(values) == contrast_over([COUNTS], [1.0])
-    assert mean_over([*values, ("tin", math.nan)]) == mean_over(values)
-    assert math.isnan(mean_over([("tin", math.nan)]).value)

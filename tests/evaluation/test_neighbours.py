@@ -7,9 +7,9 @@ import pytest
 import torch
 import trimesh
 
-from tests.pinch import QUICK, cylinder, pinch
+from tests.pinch import QUICK, cylinder, pinch, quick_trial
+from torchgrasp import close_hand
 from torchgrasp.errors import MeshError, Status
-from torchgrasp.evaluation import close_hand
 from torchgrasp.sim import Neighbour
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
@@ -17,9 +17,7 @@ SIMULATORS = ["sapien", "mujoco"]
 
 
 def box(centre, size=(0.04, 0.04, 0.06)):
-    mesh = trimesh.creation.box(size)
-    mesh.apply_translation([centre[0], centre[1], size[2] / 2])
-    return mesh
+    return trimesh.creation.box(size).apply_translation([*centre, size[2] / 2])
 
 
 def close_beside(simulator, *neighbours, mesh=None, **options):
@@ -31,7 +29,7 @@ def close_beside(simulator, *neighbours, mesh=None, **options):
 
 @pytest.mark.parametrize("simulator", SIMULATORS)
 def test_a_neighbour_out_of_the_way_changes_nothing_and_stands_still(simulator):
-    alone, beside = close_beside(simulator), close_beside(simulator, Neighbour(box((-0.3, 0.3))))
+    alone, beside = quick_trial("allegro", simulator), close_beside(simulator, Neighbour(box((-0.3, 0.3))))
     assert torch.equal(alone.disturbance.neighbour_pose, torch.zeros(len(alone.time), 0, 4, 4, dtype=torch.float64))
     assert beside.held and not beside.disturbance.early[0]
     assert float((beside.disturbance.neighbour_pose[:, 0] - torch.eye(4, dtype=torch.float64)).abs().max()) < 1e-4

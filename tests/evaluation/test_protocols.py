@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.make import near, real
 from tests.pinch import cylinder, pinch
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import (
@@ -45,20 +46,20 @@ def test_every_object_view_row_and_draw_has_an_error_of_its_own_that_others_do_n
 
 
 def test_an_object_is_moved_on_its_table_and_turned_about_the_vertical() -> None:
-    pivot = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+    pivot = real([0.3, -0.2, 0.5])
     places = draw_object_poses(PoseNoise(0.005, 0.1), pivot, 2000, seed=1)
     moved = (places[:, :3, :3] @ pivot) + places[:, :3, 3] - pivot
     assert moved[:, :2].abs().max() <= 0.005
     assert moved[:, 2].abs().max() < 1e-15
     angle = torch.atan2(places[:, 1, 0], places[:, 0, 0])
     assert angle.abs().max() <= 0.1
-    assert torch.equal(places[:, 2, :3], torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(2000, 3))
+    assert torch.equal(places[:, 2, :3], real([[0.0, 0.0, 1.0]]).expand(2000, 3))
     # uniform: standard deviation a / sqrt(3), known to 2 % from 2000 draws
     assert float(angle.std()) == pytest.approx(0.1 / math.sqrt(3), rel=0.05)
     assert float(moved[:, 0].std()) == pytest.approx(0.005 / math.sqrt(3), rel=0.05)
 
 
-def test_a_hand_in_its_place_sees_a_moved_object_as_a_moved_hand_sees_the_object_in_its_place(generator) -> None:
+def test_errors_of_any_dtype_and_device_move_the_hand_as_the_object_would_move(generator) -> None:
     turn = torch.randn(2, 3, generator=generator, dtype=torch.float64)
     shift = torch.randn(2, 3, generator=generator, dtype=torch.float64)
     obj_from_hand, place = rigid(rotation_from_vector(turn), shift)
@@ -66,9 +67,6 @@ def test_a_hand_in_its_place_sees_a_moved_object_as_a_moved_hand_sees_the_object
     seen = apply(inverse(obj_from_hand), apply(place, points))
     true_pose = apply_error(obj_from_hand, error_from_object_pose(obj_from_hand, place))
     torch.testing.assert_close(apply(inverse(true_pose), points), seen)
-
-
-def test_an_error_of_any_dtype_and_device_moves_the_hand_in_its_planned_frame(generator) -> None:
     turn, shift = torch.randn(2, 3, generator=generator, dtype=torch.float64)
     planned, error = rigid(rotation_from_vector(turn), shift), torch.eye(4, dtype=torch.float64)
     error[0, 3] = 0.25
@@ -77,7 +75,7 @@ def test_an_error_of_any_dtype_and_device_moves_the_hand_in_its_planned_frame(ge
         for dtype in (torch.float32, torch.float64):
             pose = apply_error(planned.to(device), error.to(device, dtype))
             assert pose.dtype is torch.float64 and pose.device.type == "cpu"
-            torch.testing.assert_close(pose, planned @ error, rtol=0, atol=1e-15)
+            near(pose, planned @ error, 1e-15)
     assert torch.equal(apply_error(planned.float(), None), planned.float().double())
     with pytest.raises(BadArgument, match=r"error: expected .*got"):
         apply_error(planned, torch.full((4, 4), math.nan))

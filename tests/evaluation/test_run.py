@@ -9,29 +9,24 @@ import pytest
 import torch
 import trimesh
 
-from tests.pinch import cylinder, pinch
+from tests.pinch import QUICK, cylinder, pinch
 from tests.scores import GOOD, SCORES, STUCK
+from torchgrasp import TrialSpec, load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.control import ClosingOptions
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation import views
-from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PoseNoise, Protocol, evaluate, views
 from torchgrasp.evaluation.pull import run_protocol
-from torchgrasp.evaluation.run import evaluate
 from torchgrasp.evaluation.score import STAGES, summarise
-from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.evaluation.views import EvaluationSpec, choose_rows
 from torchgrasp.files import hold_folder
-from torchgrasp.hand.load import load_hand
-from torchgrasp.specs import TrialSpec
-from torchgrasp.values import load_grasps
 
 FAMILIES = ((0, "round", "solid"), (1, "round", "solid"), (2, "round", "thin"), (3, "wire", "thin"))
 """Row of `SCORES`, family and group."""
 
 
-def test_shares_count_every_view_and_failures_their_stage():
+def test_shares_count_every_view_groups_and_families_and_failures_their_one_stage():
     found = summarise(SCORES)
     assert found["gsr"][::3] == (1 / 4, 4) and found["top1"][::3] == (1 / 4, 4) and found["objects"][::3] == (1 / 3, 3)
     assert found["refused"] == 2 and found["force_n"] == 4.0 and found["plan_cpu_s"] == 3.0
@@ -46,17 +41,11 @@ def test_shares_count_every_view_and_failures_their_stage():
     assert found["by_object"]["tin"]["gsr"][::3] == (0.5, 2) and found["by_object"]["tin"]["refused"] == 1
     noisy = [dataclasses.replace(SCORES[0], attempts=(GOOD, dataclasses.replace(STUCK, draw=1))), SCORES[1]]
     assert summarise(noisy)["top1"][::3] == (1 / 4, 4)  # two draws each, of the refused view too
-
-
-def test_groups_and_families_come_from_the_scores():
     scores = [dataclasses.replace(SCORES[k], family=family, group=group) for k, family, group in FAMILIES]
     found = summarise(scores)
     assert found["by_group"].keys() == {"solid", "thin"}
     assert found["by_group"]["solid"]["top1"][::3] == (1 / 2, 2)
     assert found["objects"].units == 2 and found["gsr"].units == 1
-
-
-def test_every_status_of_an_attempt_has_one_stage():
     stages = [status for reasons in STAGES.values() for status in reasons]
     assert sorted(stages) == [
         s for s in Status if s >= Status.START_OVERLAP and s not in (Status.BAD_OBJECT, Status.BROKEN)
@@ -113,17 +102,17 @@ def test_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(f
     pytest.importorskip("sapien"), pytest.importorskip("pebble")
     hand = load_hand("barrett")
     noise = PoseNoise(0.002, 0.02, draws=2)
-    quick = Protocol("quick", TrialSpec(hold_time=0.1), noise=noise)
-    spec = EvaluationSpec(2, "spread", starts=20)
+    quick = Protocol("quick", QUICK, noise=noise)
+    spec = EvaluationSpec(2, "spread", starts=8)
     one, two = (list(evaluate(folder, hand, quick, spec, workers=n, folder=tmp_path)) for n in (0, 2))
     assert without_times(one) == without_times(two)
     tin, torn = one
     assert [(a.rank, a.draw) for a in tin.attempts] == [(r, d) for r in (0, tin.executable - 1) for d in (0, 1)]
     assert (torn.executable, torn.refusal, torn.attempts) == (0, Status.BAD_OBJECT, ()) and "open surface" in torn.note
     assert len(load_grasps(tmp_path / "tin" / "view0.safetensors")) == tin.executable
-    planned = dataclasses.replace(spec, planned=True)
+    planned = dataclasses.replace(spec, grasps=1, planned=True)  # the best alone
     again = list(evaluate(folder, hand, quick, planned, folder=tmp_path))
-    assert without_times(again) == without_times(one)
+    assert without_times(again) == without_times([dataclasses.replace(tin, attempts=tin.attempts[:2]), torn])
     other = next(evaluate(folder, load_hand("allegro"), quick, planned, folder=tmp_path))
     assert other.refusal is Status.BAD_OBJECT and "another cloud or hand" in other.note
 
@@ -145,7 +134,7 @@ def without_times(scores):
 
 @pytest.mark.filterwarnings("ignore")
 def test_grasps_of_an_earlier_call_keep_the_reason_why_there_are_none(folder, tmp_path):
-    smooth, spec = Protocol("smooth", TrialSpec(friction=0.0)), EvaluationSpec(1, starts=20, only=("tin",))
+    smooth, spec = Protocol("smooth", TrialSpec(friction=0.0)), EvaluationSpec(1, starts=5, only=("tin",))
     (score,) = evaluate(folder, load_hand("barrett"), smooth, spec, folder=tmp_path)
     assert score.executable == 0 and score.refusal is not Status.OK
     (again,) = evaluate(folder, load_hand("barrett"), smooth, dataclasses.replace(spec, planned=True), folder=tmp_path)
@@ -160,7 +149,7 @@ def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(folder, t
     monkeypatch.setattr("torchgrasp.planner.grasps.expected_success", lambda grasps: grasps.contacts.points.shape[1])
     test = PROTOCOLS["dexgraspbench"]
     test = dataclasses.replace(test, pull=dataclasses.replace(test.pull, seconds=0.1))
-    spec = EvaluationSpec(1, starts=25, only=("tin",), fingers="auto")
+    spec = EvaluationSpec(1, starts=8, only=("tin",), fingers="auto")
     (score,) = evaluate(folder, load_hand("allegro"), test, spec, folder=tmp_path)
     assert score.fingers == "index,middle,ring,thumb" and len(score.attempts) == 1
     assert score.attempts[0].force > 1.0 and score.attempts[0].status in (Status.OK, Status.MOVED)
@@ -175,7 +164,7 @@ def test_a_pinched_cylinder_is_lifted():
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
     trial = GraspTrial(hand, grasp, cylinder(), parts=[cylinder()])
-    found = run_protocol(trial, Protocol("quick", TrialSpec(friction=0.8, hold_time=0.2)))
+    found = run_protocol(trial, Protocol("quick", QUICK))
     assert found.passed and found.status is Status.OK and found.force > 1.0 and found.moved < 0.01
     assert 0.0 <= found.overlap < 0.003
 
@@ -188,7 +177,7 @@ def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys, monkeyp
     short = dataclasses.replace(bench, pull=dataclasses.replace(bench.pull, seconds=0.2))
     monkeypatch.setitem(PROTOCOLS, "dexgraspbench", short)
     words = ["evaluate", "--objects", str(folder), "--hand", "barrett", "--out", str(tmp_path / "out")]
-    assert cli.main([*words, "--grasps", "2", "--starts", "20"]) == 0
+    assert cli.main([*words, "--grasps", "2", "--starts", "6"]) == 0
     written = json.loads((tmp_path / "out" / "evaluate.json").read_text(), parse_constant=pytest.fail)
     assert written["views"][0]["object"] == "tin" and len(written["views"][0]["attempts"]) == 2
     assert written["summary"]["top1"][3] == 2 and written["asked"]["protocol"]["name"] == "dexgraspbench"

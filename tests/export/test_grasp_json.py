@@ -10,11 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.pinch import pinch
+from torchgrasp import load_hand
 from torchgrasp.app import cli
 from torchgrasp.control.forces import squeeze
 from torchgrasp.export import format_grasps, format_keyframes
 from torchgrasp.geometry.frames import apply
-from torchgrasp.hand.load import load_hand
 
 HANDS = ["allegro", "barrett"]
 
@@ -89,7 +89,7 @@ def test_a_robot_of_half_the_stiffness_gets_twice_the_lead():
     assert len(gains) == 16 and set(gains) == {"1.5"}
 
 
-def test_the_command_writes_both_and_names_what_is_wrong(tmp_path, capsys):
+def test_the_command_writes_both_names_what_is_wrong_and_no_grasps_are_an_empty_list(tmp_path, capsys):
     hand, grasp = pinch("allegro")
     grasp = dataclasses.replace(grasp, meta={"hand": "allegro", "hand_sha256": hand.source.sha256})
     grasp.save(tmp_path / "grasps.safetensors")
@@ -101,9 +101,6 @@ def test_the_command_writes_both_and_names_what_is_wrong(tmp_path, capsys):
         more = [named, value]
         assert cli.main([*words, *more]) == 2
         assert named in capsys.readouterr().err
-
-
-def test_no_grasps_are_an_empty_list():
     hand = load_hand("allegro")
     grasp = pinch("allegro")[1][torch.zeros(0, dtype=torch.int64)]
     assert json.loads(format_grasps(hand, grasp))["grasps"] == []

@@ -8,7 +8,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.make import near
 from tests.pinch import cylinder, pinch
+from torchgrasp import certify
 from torchgrasp.app import cli
 from torchgrasp.cloud import look_at, partial_view, save_cloud
 from torchgrasp.control.forces import squeeze
@@ -22,7 +24,6 @@ from torchgrasp.export import (
     read_foreign,
     save_dexgraspbench,
 )
-from torchgrasp.plan import certify
 
 yaml = pytest.importorskip("yaml")
 
@@ -108,12 +109,18 @@ def test_moveit_gets_postures_pose_approach_and_quality(name):
     assert message["grasp_pose"]["header"] == {"frame_id": "object"}
 
 
-def test_every_number_of_the_yaml_is_a_number_however_small():
+def test_every_number_of_the_yaml_is_a_number_and_graspgen_finds_transforms_and_mask():
     hand, grasp = pinch("allegro")
     tiny = dataclasses.replace(grasp, pregrasp=torch.full_like(grasp.pregrasp, 1e-12), score=torch.tensor([-40.0]))
     (message,) = yaml.safe_load(format_moveit(hand, tiny))
     assert all(isinstance(x, float) for x in message["pre_grasp_posture"]["points"][0]["positions"])
     assert message["grasp_quality"] == 0.0
+    _, grasp = pinch("allegro")
+    lost = dataclasses.replace(grasp, status=torch.tensor([21]))
+    content = json.loads(format_graspgen(lost, "cup/mesh.obj"))
+    assert content["object"] == {"file": "cup/mesh.obj", "scale": 1.0}
+    np.testing.assert_array_equal(content["grasps"]["transforms"], grasp.obj_from_hand.numpy())
+    assert content["grasps"]["object_in_gripper"] == [False]
 
 
 def test_a_trajectory_each_goes_from_pregrasp_to_squeeze():
@@ -128,15 +135,6 @@ def test_a_trajectory_each_goes_from_pregrasp_to_squeeze():
     assert found == pytest.approx([float(last[joint][0]) for joint in documents[0]["joint_names"]], abs=1e-9)
     none = grasp[torch.zeros(0, dtype=torch.int64)]
     assert yaml.safe_load(format_moveit(hand, none)) == []
-
-
-def test_graspgen_finds_object_transforms_and_mask():
-    _, grasp = pinch("allegro")
-    lost = dataclasses.replace(grasp, status=torch.tensor([21]))
-    content = json.loads(format_graspgen(lost, "cup/mesh.obj"))
-    assert content["object"] == {"file": "cup/mesh.obj", "scale": 1.0}
-    np.testing.assert_array_equal(content["grasps"]["transforms"], grasp.obj_from_hand.numpy())
-    assert content["grasps"]["object_in_gripper"] == [False]
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -157,17 +155,14 @@ def test_grasps_of_joints_alone_have_contacts_certificates_and_a_pregrasp(name):
     assert bool(torch.isfinite(squeezed.joints).all())
 
 
-def test_our_json_comes_back_to_the_same_grasps(tmp_path):
+def test_our_json_and_dexgraspbench_come_back_to_the_same_grasps(tmp_path):
     hand, grasp = pinch("barrett")
     file = tmp_path / "grasps.json"
     file.write_text(format_grasps(hand, grasp))
     read = read_foreign(file, hand)
     torch.testing.assert_close(read.joints, grasp.joints)
     torch.testing.assert_close(read.pregrasp, grasp.pregrasp)
-    torch.testing.assert_close(read.obj_from_hand, grasp.obj_from_hand, atol=1e-9, rtol=0)
-
-
-def test_dexgraspbench_comes_back_through_npz(tmp_path):
+    near(read.obj_from_hand, grasp.obj_from_hand, 1e-9)
     hand, grasp = pinch("allegro")
     (path,) = save_dexgraspbench(hand, grasp, tmp_path, "x")
     content = np.load(path, allow_pickle=True).item()
@@ -175,7 +170,7 @@ def test_dexgraspbench_comes_back_through_npz(tmp_path):
     read = read_foreign(tmp_path / "grasps.npz", hand)
     torch.testing.assert_close(read.joints, grasp.joints)
     torch.testing.assert_close(read.pregrasp, grasp.pregrasp)
-    torch.testing.assert_close(read.obj_from_hand, grasp.obj_from_hand, atol=1e-9, rtol=0)
+    near(read.obj_from_hand, grasp.obj_from_hand, 1e-9)
 
 
 def test_multigrippergrasp_needs_the_order_of_its_joints(tmp_path):
@@ -194,7 +189,7 @@ def test_multigrippergrasp_needs_the_order_of_its_joints(tmp_path):
         file.write_text(json.dumps(content))
         read = read_foreign(file, hand, order, quaternion)
         torch.testing.assert_close(read.joints, grasp.joints)
-        torch.testing.assert_close(read.obj_from_hand, grasp.obj_from_hand, atol=1e-9, rtol=0)
+        near(read.obj_from_hand, grasp.obj_from_hand, 1e-9)
         assert read.pregrasp is None
     for wrong in ((), order[:-1], (*order[:-1], "spread")):
         with pytest.raises(BadArgument, match="order"):
@@ -213,16 +208,13 @@ def test_a_malformed_file_is_refused_by_name(tmp_path, content):
         read_foreign(file, hand, hand.joint_names)
 
 
-def test_a_pose_of_too_few_numbers_is_refused_by_its_place(tmp_path):
+def test_poses_of_too_few_numbers_and_an_npz_of_pickles_wrong_shapes_or_nan_are_refused(tmp_path):
     hand, grasp = pinch("allegro")
     content = json.loads(format_grasps(hand, grasp))
     content["grasps"][0]["pose"]["position"].pop()
     (tmp_path / "grasps.json").write_text(json.dumps(content))
     with pytest.raises(BadArgument, match=r"expected 3 numbers.*grasps\[0\]\.pose\.position"):
         read_foreign(tmp_path / "grasps.json", hand)
-
-
-def test_an_npz_of_pickles_wrong_shapes_or_nan_is_refused(tmp_path):
     hand, _ = pinch("allegro")
     file = tmp_path / "grasps.npz"
     row = np.concatenate([[0, 0, 0, 1, 0, 0, 0], np.zeros(16)])

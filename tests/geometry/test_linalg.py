@@ -17,20 +17,13 @@ from torchgrasp.geometry.linalg import (
 
 
 @pytest.mark.promise("I11")
-def test_cholesky_raises_with_the_smallest_eigenvalue():
+def test_cholesky_adds_nothing_and_raises_with_the_smallest_eigenvalue(generator):
     matrix = torch.tensor([[1.0, 2.0], [2.0, 1.0]], dtype=torch.float64)
     with pytest.raises(IndefiniteCovariance, match="buy a better matrix") as caught:
         cholesky(matrix, "K", "buy a better matrix")
     assert caught.value.smallest_eigenvalue == pytest.approx(-1.0)
-
-
-def test_cholesky_refuses_nan():
     with pytest.raises(IndefiniteCovariance):
         cholesky(torch.full((2, 2), float("nan")), "K", "-")
-
-
-@pytest.mark.promise("I11")
-def test_cholesky_adds_nothing(generator):
     a = torch.randn(5, 5, generator=generator, dtype=torch.float64)
     matrix = a @ a.T + torch.eye(5, dtype=torch.float64)
     factor = cholesky(matrix, "K", "-")
@@ -45,13 +38,10 @@ def test_mahalanobis_against_the_inverse(generator):
     torch.testing.assert_close(squared_mahalanobis(x, torch.linalg.cholesky(sigma)), expected)
 
 
-def test_unit(generator):
+def test_unit_vectors_of_any_length_and_limited_norms_keep_the_direction(generator):
     v = torch.randn(9, 3, generator=generator)
     torch.testing.assert_close(unit(v).norm(dim=-1), torch.ones(9))
     assert bool(torch.isnan(unit(torch.zeros(3))).all())
-
-
-def test_a_direction_of_any_length_has_one(generator):
     v = torch.randn(50, 3, generator=generator, dtype=torch.float64)
     for length in (1.0, 1e-300, 1e160, 1e300):
         assert torch.allclose(unit_of_any(v * length), unit(v), rtol=0, atol=1e-15)
@@ -59,35 +49,6 @@ def test_a_direction_of_any_length_has_one(generator):
         assert torch.equal(unit_of_any(v * length), unit(v * length))
     assert torch.equal(unit_of_any(v.float()), unit(v.float()))
     assert bool(unit_of_any(torch.zeros(1, 3)).isnan().all())
-
-
-def test_farthest_points_are_all_points_when_there_are_few(generator):
-    p = torch.rand(5, 3, generator=generator)
-    assert sorted(farthest_points(p, 9).tolist()) == [0, 1, 2, 3, 4]
-    assert len(farthest_points(p[:0], 9)) == 0
-
-
-def test_each_farthest_point_is_the_farthest_from_those_before_it(generator):
-    p = torch.rand(60, 3, generator=generator, dtype=torch.float64)
-    picks = farthest_points(p, 12, first=7).tolist()
-    assert picks[0] == 7
-    for k in range(1, 12):
-        nearest = torch.cdist(p, p[picks[:k]]).amin(1)
-        assert nearest[picks[k]] == nearest.max()
-
-
-def test_farthest_points_are_the_same_however_distances_are_measured(generator):
-    p = torch.rand(200, 3, generator=generator, dtype=torch.float64).round(decimals=1)  # with ties
-    picks = farthest_points(p, 40, first=3, tie=1e-9)
-    assert torch.equal(picks, farthest_points(p, 40, first=3, tie=1e-9, distance=lambda x, y: (x - y).square().sum(-1)))
-
-
-def test_of_points_that_tie_the_first_is_the_farthest():
-    p = torch.tensor([[0.0], [1.0], [1.0 + 1e-12]], dtype=torch.float64)
-    assert farthest_points(p, 2).tolist() == [0, 2] and farthest_points(p, 2, tie=1e-9).tolist() == [0, 1]
-
-
-def test_a_limited_norm_keeps_the_direction(generator):
     v = torch.cat([torch.randn(20, 3, generator=generator, dtype=torch.float64), torch.zeros(1, 3)])
     short = limit_norm(v, 1.0)
     assert (short.norm(dim=-1) <= 1.0 + 1e-12).all()
@@ -96,7 +57,24 @@ def test_a_limited_norm_keeps_the_direction(generator):
     torch.testing.assert_close(unit(short[:20]), unit(v[:20]))
 
 
-def test_farthest_points_keep_away_from_points_before(generator):
+def test_each_farthest_point_is_the_farthest_from_those_before_it_and_the_first_of_a_tie(generator):
+    p = torch.rand(5, 3, generator=generator)
+    assert sorted(farthest_points(p, 9).tolist()) == [0, 1, 2, 3, 4]
+    assert len(farthest_points(p[:0], 9)) == 0
+    p = torch.rand(60, 3, generator=generator, dtype=torch.float64)
+    picks = farthest_points(p, 12, first=7).tolist()
+    assert picks[0] == 7
+    for k in range(1, 12):
+        nearest = torch.cdist(p, p[picks[:k]]).amin(1)
+        assert nearest[picks[k]] == nearest.max()
+    p = torch.tensor([[0.0], [1.0], [1.0 + 1e-12]], dtype=torch.float64)
+    assert farthest_points(p, 2).tolist() == [0, 2] and farthest_points(p, 2, tie=1e-9).tolist() == [0, 1]
+
+
+def test_farthest_points_by_any_distance_keep_away_from_points_before(generator):
+    p = torch.rand(200, 3, generator=generator, dtype=torch.float64).round(decimals=1)  # with ties
+    picks = farthest_points(p, 40, first=3, tie=1e-9)
+    assert torch.equal(picks, farthest_points(p, 40, first=3, tie=1e-9, distance=lambda x, y: (x - y).square().sum(-1)))
     points, before = torch.rand(40, 2, generator=generator), torch.rand(7, 2, generator=generator)
     picks, known = farthest_points(points, 12, before=before).tolist(), [*before]
     for pick in picks:

@@ -56,17 +56,11 @@ def test_read_mesh_refuses_what_is_no_body(mesh, reason):
         read_mesh(mesh)
 
 
-def test_a_mesh_of_a_plane_is_refused(tmp_path):
-    """Its surface is closed, but its corners have two numbers: the third of every `v` is missing."""
-    box = cube()
-    lines = [f"v {x} {y}" for x, y, _ in box.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces]
-    (tmp_path / "flat.obj").write_text("\n".join(lines) + "\n")
-    with pytest.raises(MeshError, match="expected "):
-        read_mesh(tmp_path / "flat.obj")
-
-
-def test_a_hollow_body_is_sound():
+@pytest.mark.parametrize("size", [1e-4, 10.0])
+def test_meshes_of_another_unit_are_refused_and_a_hollow_body_is_sound(size):
     assert read_mesh(trimesh.util.concatenate([cube(), turned(cube(0.08))])).volume < 0.001
+    with pytest.raises(SuspiciousScale, match="use metres"):
+        read_mesh(trimesh.creation.box((size, size, 2 * size)))
 
 
 def test_groups_and_materials_of_an_obj_are_left_out(tmp_path):
@@ -89,13 +83,7 @@ def test_a_file_that_packs_or_names_others_is_no_mesh(tmp_path, suffix):
         read_mesh(path)
 
 
-@pytest.mark.parametrize("size", [1e-4, 10.0])
-def test_meshes_of_another_unit_are_refused(size):
-    with pytest.raises(SuspiciousScale, match="use metres"):
-        read_mesh(trimesh.creation.box((size, size, 2 * size)))
-
-
-def test_bad_files_are_refused(tmp_path):
+def test_bad_files_and_a_mesh_of_a_plane_are_refused(tmp_path):
     with pytest.raises(MeshError, match="no file"):
         read_mesh(tmp_path / "none.ply")
     (tmp_path / "noise.ply").write_bytes(b"ply\nnonsense")
@@ -104,6 +92,11 @@ def test_bad_files_are_refused(tmp_path):
     path = tmp_path / "box.ply"
     cube().export(path)
     assert read_mesh(str(path)).volume == pytest.approx(1e-3)
+    box = cube()
+    lines = [f"v {x} {y}" for x, y, _ in box.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces]
+    (tmp_path / "flat.obj").write_text("\n".join(lines) + "\n")
+    with pytest.raises(MeshError, match="expected "):
+        read_mesh(tmp_path / "flat.obj")
 
 
 @pytest.mark.promise("H2")
@@ -142,9 +135,6 @@ def test_a_ball_cut_by_a_plane_keeps_the_area_of_the_cap_and_its_winding(height:
     assert (kept.face_normals * kept.triangles_center).sum(1)[wide].min() > 0.9
     assert vertices[:, 2].max() < height + 1e-12
     np.testing.assert_allclose(vertices[cut, 2], height, atol=1e-12)
-
-
-def test_nothing_and_all_of_a_mesh():
     box = trimesh.creation.box()
     vertices, faces, cut = clip_mesh(box.vertices, box.faces, -np.ones(8))
     assert len(faces) == 12 and len(vertices) == 8 and not cut.any()
@@ -152,7 +142,7 @@ def test_nothing_and_all_of_a_mesh():
 
 
 @pytest.mark.promise("H5")
-def test_a_mesh_beyond_the_limits_is_refused_before_it_is_read(tmp_path, monkeypatch):
+def test_a_mesh_or_parts_beyond_the_limits_are_refused_before_they_are_read(tmp_path, monkeypatch):
     path = tmp_path / "big.ply"
     with path.open("wb") as file:
         file.truncate(MESH_BYTES + 1)
@@ -161,9 +151,6 @@ def test_a_mesh_beyond_the_limits_is_refused_before_it_is_read(tmp_path, monkeyp
     monkeypatch.setattr("torchgrasp.geometry.mesh.MESH_FACES", 11)
     with pytest.raises(MeshError, match="of 12 faces"):
         read_mesh(cube())
-
-
-def test_too_many_parts_are_refused_before_they_are_looked_at():
     with pytest.raises(MeshError, match="at most 1000"):
         check_parts([trimesh.Trimesh()] * 1001)
 

@@ -3,21 +3,15 @@
 import pytest
 import torch
 
+from tests.make import random_motion
+from torchgrasp import ContactSpec, PointCloud, fit_shape
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import GRID, Plane, as_plane, move, round_upright, upright_frame
-from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import Surface
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import PointCloud
 
 F64 = torch.float64
-
-
-def random_pose(seed: int) -> torch.Tensor:
-    draw = torch.randn(2, 3, generator=torch.Generator().manual_seed(seed), dtype=F64)
-    return rigid(rotation_from_vector(3 * draw[0]), draw[1])
 
 
 def random_cloud(viewpoint: bool) -> PointCloud:
@@ -26,9 +20,16 @@ def random_cloud(viewpoint: bool) -> PointCloud:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_heights_do_not_depend_on_the_frame(seed):
-    plane, pose, points = Plane.horizontal(0.3), random_pose(seed), random_cloud(False).points
+def test_heights_do_not_depend_on_the_frame_and_surfaces_move(seed):
+    plane, pose, points = Plane.horizontal(0.3), random_motion(seed), random_cloud(False).points
     torch.testing.assert_close(plane.moved(pose).height(apply(pose, points)), points[:, 2] - 0.3)
+    pose, points = random_motion(2), random_cloud(False).points
+    faces = torch.arange(48).view(-1, 3)
+    surface = Surface(points, faces, unit(points), points[:, 0])
+    there = move(surface, pose)
+    torch.testing.assert_close(there.vertices, apply(pose, points))
+    torch.testing.assert_close(there.normals, surface.normals @ pose[:3, :3].T)
+    assert torch.equal(there.std_m, surface.std_m) and torch.equal(there.faces, faces)
 
 
 @pytest.mark.parametrize("viewpoint", [True, False])
@@ -39,7 +40,7 @@ def test_a_moved_cloud_is_the_same_to_the_last_bit_in_its_upright_frame(viewpoin
     upright = round_upright(cloud, frame)
     assert float((apply(frame, upright.points) - cloud.points).norm(dim=1).max()) <= 1.5 * GRID
     for seed in range(20):
-        pose = random_pose(seed)
+        pose = random_motion(seed)
         there = move(cloud, pose)
         other = round_upright(
             there, upright_frame(there.points, there.viewpoint, None if table is None else table.moved(pose))
@@ -48,8 +49,8 @@ def test_a_moved_cloud_is_the_same_to_the_last_bit_in_its_upright_frame(viewpoin
         assert viewpoint is False or torch.equal(other.viewpoint, upright.viewpoint)
 
 
-def test_an_upright_frame_stands_on_the_table_and_looks_at_the_camera():
-    cloud, pose = random_cloud(True), random_pose(3)
+def test_an_upright_frame_stands_on_the_table_and_looks_at_the_camera_or_the_farthest_point():
+    cloud, pose = random_cloud(True), random_motion(3)
     table = Plane.horizontal(-0.1).moved(pose)
     moved = move(cloud, pose)
     frame = upright_frame(moved.points, moved.viewpoint, table)
@@ -57,9 +58,6 @@ def test_an_upright_frame_stands_on_the_table_and_looks_at_the_camera():
     torch.testing.assert_close(frame[:3, 2], table.normal)
     eye = apply(inverse(frame), moved.viewpoint[None])[0]
     assert abs(float(eye[1])) < 1e-12 and float(eye[0]) > 0
-
-
-def test_straight_down_the_azimuth_is_that_of_the_farthest_point():
     points = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0.2, 0.05]], dtype=F64)
     cloud = PointCloud(points, None, points.mean(0) + torch.tensor([0.0, 0, 0.5], dtype=F64))
     x = upright_frame(cloud.points, cloud.viewpoint, Plane.horizontal(0.0))[:3, 0]
@@ -67,29 +65,13 @@ def test_straight_down_the_azimuth_is_that_of_the_farthest_point():
 
 
 @pytest.mark.parametrize("table", [float("nan"), float("inf")])
-def test_a_table_is_a_plane_a_height_or_nothing(table):
+def test_a_table_is_finite_and_below_the_object_and_a_normal_has_unit_length(table):
     with pytest.raises(BadArgument, match="table"):
         as_plane(table)
     with pytest.raises(BadArgument, match="table"):
         ContactSpec(table=table)
-
-
-def test_a_normal_has_unit_length():
     with pytest.raises(BadArgument, match="normal"):
         Plane(torch.tensor([0.0, 0, 2.0]), 0.0)
-
-
-def test_every_place_and_direction_of_a_surface_moves():
-    pose, points = random_pose(2), random_cloud(False).points
-    faces = torch.arange(48).view(-1, 3)
-    surface = Surface(points, faces, unit(points), points[:, 0])
-    there = move(surface, pose)
-    torch.testing.assert_close(there.vertices, apply(pose, points))
-    torch.testing.assert_close(there.normals, surface.normals @ pose[:3, :3].T)
-    assert torch.equal(there.std_m, surface.std_m) and torch.equal(there.faces, faces)
-
-
-def test_a_table_above_the_object_is_refused_before_any_work():
     cloud = random_cloud(viewpoint=True)
     above = 0.2 - cloud.points[:, 2].sort().values[24]
     with pytest.raises(

@@ -4,7 +4,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import field_of_mesh
+from tests.make import field_of_mesh, real
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.self_collision import box_distance
@@ -29,40 +29,30 @@ def test_distance_field_of_a_box_has_the_right_sides(generator):
     field = field_of_mesh(box, margin=0.03)
     points = 0.06 * torch.randn(3000, 3, generator=generator, dtype=torch.float64)
     points = points.clamp(-0.04, 0.04)
-    half = torch.tensor([0.015, 0.03, 0.06], dtype=torch.float64)
+    half = real([0.015, 0.03, 0.06])
     truth = box_distance(points, half.expand_as(points))
     error = (field.query(points)[0] - truth).abs()
     assert float(error.max()) < 2e-3
     assert float(error.median()) < 2e-4
 
 
-def test_distance_field_gradient_is_the_derivative_inside_and_beyond(generator):
+def test_distance_field_gradient_is_the_derivative_and_follows_dtype_and_shape_of_the_points(generator):
     field = field_of_mesh(trimesh.creation.icosphere(3, 0.03), margin=0.02)
     points = (0.06 * torch.randn(300, 3, generator=generator, dtype=torch.float64)).requires_grad_()
     distance, gradient = field.query(points)
     (derivative,) = torch.autograd.grad(distance.sum(), points)
     torch.testing.assert_close(gradient, derivative, atol=1e-9, rtol=0)
-    far = torch.tensor([[1.0, 0, 0]], dtype=torch.float64)
+    far = real([[1.0, 0, 0]])
     reach = field.origin[0] + field.spacing * (field.values.shape[0] - 1)
     at_border, _ = field.query(torch.stack([reach, far[0, 1], far[0, 2]])[None])
     torch.testing.assert_close(field.query(far)[0], at_border + 1.0 - reach)
-
-
-def test_distance_field_follows_the_dtype_and_shape_of_the_points():
     field = field_of_mesh(trimesh.creation.icosphere(2, 0.03), margin=0.02)
     distance, gradient = field.query(torch.zeros(2, 3, 4, 3))
     assert (distance.shape, gradient.shape, distance.dtype) == ((2, 3, 4), (2, 3, 4, 3), torch.float32)
     torch.testing.assert_close(field.to(torch.float32).query(torch.zeros(2, 3, 4, 3))[0], distance)
 
 
-def test_distance_field_of_a_flat_patch_without_margin():
-    vertices = torch.tensor([[0.0, 0, 0], [0.03, 0, 0], [0, 0.03, 0]], dtype=torch.float64)
-    field = field_from_surface(vertices, torch.tensor([[0, 1, 2]]), margin=0.0)
-    distance, _ = field.query(torch.tensor([[0.008, 0.008, 0.004]], dtype=torch.float64))
-    assert float(distance) == pytest.approx(0.004, abs=1e-6)
-
-
-def test_distances_of_an_open_mesh_do_not_vanish_where_their_sign_jumps():
+def test_distances_of_open_meshes_do_not_vanish_where_their_sign_jumps():
     side = 0.02
     vertices = torch.tensor([[-side, -side, 0], [side, -side, 0], [side, side, 0], [-side, side, 0]]).double()
     field = field_from_surface(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), margin=0.05)
@@ -73,6 +63,10 @@ def test_distances_of_an_open_mesh_do_not_vanish_where_their_sign_jumps():
     error = (field.values.abs() - torch.linalg.vector_norm(beyond, dim=-1)).abs()
     assert float(error.max()) < 2e-3
     assert float(error.median()) < 1e-4
+    vertices = real([[0.0, 0, 0], [0.03, 0, 0], [0, 0.03, 0]])
+    field = field_from_surface(vertices, torch.tensor([[0, 1, 2]]), margin=0.0)
+    distance, _ = field.query(real([[0.008, 0.008, 0.004]]))
+    assert float(distance) == pytest.approx(0.004, abs=1e-6)
 
 
 def test_bad_surfaces_are_named():

@@ -4,7 +4,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import box
+from tests.make import box, real
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
@@ -12,7 +12,7 @@ from torchgrasp.geometry.support import find_supports, fit_support
 from torchgrasp.scene.image import read_image
 
 POSE = look_at(30.0, 40.0, 0.6)
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+UP = real([0.0, 0.0, 1.0])
 
 
 THINGS = [
@@ -34,16 +34,12 @@ def seen():
     return look(THINGS)
 
 
-def test_a_noisy_table_is_found_in_place(seen):
+def test_a_noisy_table_is_found_in_place_and_moves_with_the_points(seen):
     points, viewpoint = seen
     for eye in (viewpoint, None):
         plane = fit_support(points, eye)
         assert math.degrees(math.acos(min(1.0, float(plane.normal[2])))) < 0.3
         assert abs(plane.offset) < 0.001
-
-
-def test_a_rigid_motion_moves_the_plane_alike(seen):
-    points, viewpoint = seen
     plane = fit_support(points, viewpoint)
     generator = torch.Generator().manual_seed(1)
     for _ in range(5):
@@ -55,21 +51,29 @@ def test_a_rigid_motion_moves_the_plane_alike(seen):
         assert abs(moved.offset - expected.offset) < 1e-9
 
 
-def test_gravity_is_used_and_must_agree(seen):
+def test_gravity_is_used_and_must_agree_and_bad_arguments_are_named(seen):
     assert fit_support(*seen, torch.tensor([0.0, 0.3, 2.0]).double()).normal[2] > 0.999
     with pytest.raises(NoSupport):
         fit_support(*seen, torch.tensor([1.0, 0.0, 0.0]).double())
     with pytest.raises(NoSupport, match="from above"):
         fit_support(*seen, -UP)
+    with pytest.raises(BadArgument, match="points"):
+        fit_support(seen[0] * torch.nan)
+    with pytest.raises(BadArgument, match="viewpoint"):
+        fit_support(seen[0], torch.full((3,), torch.inf))
+    with pytest.raises(NoSupport, match="7 points"):
+        fit_support(seen[0][:7])
 
 
-def test_a_plane_through_which_things_are_seen_is_no_table():
+def test_a_plane_through_which_things_are_seen_is_no_table_and_floating_ones_have_none():
     frame = [box([0.15, 0.6, 0.01], [x, 0.0, -0.005]) for x in (-0.225, 0.225)]
     frame += [box([0.6, 0.15, 0.01], [0.0, y, -0.005]) for y in (-0.225, 0.225)]
     below = box([0.4, 0.4, 0.1], [0.0, 0.0, -0.2])
     cup = box([0.05, 0.05, 0.05], [0.2, 0.0, 0.025])
     with pytest.raises(NoSupport):
         fit_support(*look([*frame, below, cup], table=None))
+    with pytest.raises(NoSupport):
+        fit_support(*look(THINGS, table=None))
 
 
 @pytest.mark.parametrize("size", [[0.2, 0.15, 0.1], [0.16, 0.08, 0.008], [0.3, 0.3, 0.02]])
@@ -78,18 +82,15 @@ def test_a_flat_face_of_a_lone_thing_is_no_table(size):
         fit_support(*look([trimesh.creation.box(size)], table=None))
 
 
-def test_things_that_float_have_no_table():
-    with pytest.raises(NoSupport):
-        fit_support(*look(THINGS, table=None))
-
-
-def test_a_table_before_a_wall_needs_no_gravity():
+def test_a_table_before_a_wall_or_above_a_deep_floor_needs_no_gravity():
     seen = look([*THINGS, box([0.01, 2.0, 2.0], [-0.35, 0.0, 0.5])], pose=look_at(0.0, 35.0, 0.7))
     for up in (UP, None):
         assert fit_support(*seen, up).normal[2] > 0.9999
+    floor = box([3.0, 3.0, 0.01], [0.0, 0.0, -0.7])
+    assert abs(fit_support(*look([*THINGS, floor], pose=look_at(0.0, 35.0, 0.9))).offset) < 0.002
 
 
-def test_the_table_comes_before_the_floor_that_carries_more():
+def test_the_table_comes_before_the_floor_that_carries_more_and_a_bins_floor_supports():
     top, floor = box([0.5, 0.4, 0.02], [0.0, 0.0, -0.01]), box([4.0, 4.0, 0.01], [0.0, 0.0, -0.455])
     boxes = [box([0.2, 0.2, 0.2], [x, y, -0.35]) for x in (0.5, -0.6) for y in (-0.5, 0.5)]
     cup = box([0.06, 0.06, 0.08], [0.0, 0.0, 0.04])
@@ -97,28 +98,11 @@ def test_the_table_comes_before_the_floor_that_carries_more():
     first, second = find_supports(*look([top, floor, *boxes, cup], table=None, pose=pose))[:2]
     assert abs(first.plane.offset) < 0.003 and abs(second.plane.offset + 0.45) < 0.01
     assert bool(first.covers(torch.tensor([0.2, 0.1, 0.3]))) and not bool(first.covers(torch.tensor([0.3, 0.1, 0.3])))
-
-
-def test_the_floor_of_a_bin_is_the_support():
     walls = [box([0.02, 0.5, 0.25], [x, 0.0, 0.125]) for x in (-0.2, 0.2)]
     walls += [box([0.4, 0.02, 0.25], [0.0, y, 0.125]) for y in (-0.25, 0.25)]
     toy = box([0.05, 0.08, 0.04], [0.03, 0.05, 0.02])
     plane = fit_support(*look([*walls, toy], pose=look_at(20.0, 80.0, 0.7)))
     assert plane.normal[2] > 0.999 and abs(plane.offset) < 0.002
-
-
-def test_a_floor_deep_below_is_no_objection():
-    floor = box([3.0, 3.0, 0.01], [0.0, 0.0, -0.7])
-    assert abs(fit_support(*look([*THINGS, floor], pose=look_at(0.0, 35.0, 0.9))).offset) < 0.002
-
-
-def test_bad_arguments_are_named(seen):
-    with pytest.raises(BadArgument, match="points"):
-        fit_support(seen[0] * torch.nan)
-    with pytest.raises(BadArgument, match="viewpoint"):
-        fit_support(seen[0], torch.full((3,), torch.inf))
-    with pytest.raises(NoSupport, match="7 points"):
-        fit_support(seen[0][:7])
 
 
 def test_a_plane_that_objects_go_through_is_no_support():

@@ -6,8 +6,8 @@ import coal
 import numpy as np
 import torch
 
+from torchgrasp import Hand
 from torchgrasp.geometry.frames import rotation_from_rpy
-from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 
 LEFT_OUT = frozenset(frozenset(("palm", f"f{k}_med")) for k in (1, 2))

@@ -6,6 +6,7 @@ import torch
 import trimesh
 from scipy.optimize import linprog
 
+from tests.make import near, real
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.hand.self_collision import BoxPairs, box_distance
 
@@ -56,10 +57,10 @@ def test_separation_of_boxes_is_coals_depth_and_at_most_its_distance(generator):
     assert (found.numpy()[~met] >= truth[~met] / 3**0.5 - 1e-6).all()
 
 
-def test_separation_of_boxes_closed_forms():
+def test_separation_of_boxes_closed_forms_gradient_and_dtype(generator):
     eye, unit = torch.eye(3, dtype=torch.float64)[..., None], torch.ones(3, 1, dtype=torch.float64)
-    quarter = rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 4], dtype=torch.float64))[..., None]
-    tilted = rotation_from_vector(torch.tensor([torch.pi / 4, 0.0, 0.0], dtype=torch.float64))[..., None]
+    quarter = rotation_from_vector(real([0.0, 0.0, torch.pi / 4]))[..., None]
+    tilted = rotation_from_vector(real([torch.pi / 4, 0.0, 0.0]))[..., None]
     for a, b, gap, expected in [
         (eye, eye, (3.0, 0.5, 0.0), 1.0),  # face to face
         (eye, eye, (0.5, 0.0, 1.0), -1.0),  # within one another
@@ -68,24 +69,21 @@ def test_separation_of_boxes_closed_forms():
         (quarter, rotation_from_vector(torch.tensor([0.0, torch.pi / 4, 0]).double())[..., None], (4.0, 0.0, 0.0),
          4 - 2 * 2**0.5),  # crossing edges
     ]:  # fmt: skip
-        found = separation(a, b, torch.tensor(gap, dtype=torch.float64)[:, None], unit, unit)
+        found = separation(a, b, real(gap)[:, None], unit, unit)
         assert float(found) == pytest.approx(expected, abs=1e-12)
-
-
-def test_separation_of_boxes_gradient_and_dtype(generator):
     given = [x[..., 10:] for x in boxes(30, generator)]  # where axes are parallel it has kinks
     assert torch.autograd.gradcheck(separation, [x.requires_grad_() for x in given])
     with torch.no_grad():
         single = separation(*(x.float() for x in given))
-        torch.testing.assert_close(single.double(), separation(*given), atol=1e-5, rtol=0)
+        near(single.double(), separation(*given), 1e-5)
 
 
 def test_box_distance_is_that_of_trimesh(generator):
-    half = torch.tensor([0.5, 1.0, 1.5], dtype=torch.float64)
+    half = real([0.5, 1.0, 1.5])
     points = 2 * torch.randn(300, 3, generator=generator, dtype=torch.float64)
     box = trimesh.creation.box(extents=2 * half.numpy())
     truth = -trimesh.proximity.signed_distance(box, points.numpy())
     found = box_distance(points, half.expand_as(points))
-    torch.testing.assert_close(found, torch.tensor(truth), atol=1e-9, rtol=0)
+    near(found, torch.tensor(truth), 1e-9)
     points.requires_grad_()
     assert torch.autograd.gradcheck(lambda p: box_distance(p, half.expand_as(p)), (points[:50],))

@@ -38,6 +38,11 @@ def test_an_option_its_number_and_its_fingers_are_the_same_hand(wanted):
     assert hand.source.option == "four" and hand.dof == 16
     assert hand.finger_names == ("index", "middle", "ring", "thumb")
     assert load_hand("allegro", 3).finger_names == load_hand("allegro").finger_names
+    hand = load_hand("allegro")
+    assert with_fingers(hand, "default") is hand and with_fingers(hand, hand.finger_names) is hand
+    four = with_fingers(hand.to(torch.float32), 4)
+    assert four.finger_names == ("index", "middle", "ring", "thumb") and four.lower.dtype == torch.float32
+    assert hand.source.options == ("default", "four", "paper_literal")
 
 
 def test_each_finger_touches_where_it_does_in_the_options_of_three(generator):
@@ -80,14 +85,6 @@ def test_parked_joints_without_zero_in_their_range_stay_at_the_limit_next_to_it(
     offset = load_hand(toy_hand, ("f2", "f3", "f5")).actuated.offset
     assert dict(zip(names, offset.tolist(), strict=True)) == {"j1": 0.2, "j2": 0.0, "j3": 0.0, "j4": 0.5, "j5": 0.0}
     assert load_hand(toy_hand, 5).dof == 5
-
-
-def test_other_fingers_of_the_same_hand():
-    hand = load_hand("allegro")
-    assert with_fingers(hand, "default") is hand and with_fingers(hand, hand.finger_names) is hand
-    four = with_fingers(hand.to(torch.float32), 4)
-    assert four.finger_names == ("index", "middle", "ring", "thumb") and four.lower.dtype == torch.float32
-    assert hand.source.options == ("default", "four", "paper_literal")
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from tests.make import near, real
+from torchgrasp import Hand, load_hand
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rotation_from_rpy
-from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import largest_fk_error, random_joints
 
@@ -21,20 +21,16 @@ def hand(request) -> Hand:
     return load_hand(*request.param)
 
 
-@pytest.mark.promise("N13")
-def test_fk_equals_yourdfpy_coupled_joints_included(hand):
+@pytest.mark.promise("N13", "N8")
+def test_fk_equals_yourdfpy_coupled_joints_included_and_float32_within_a_micrometre(hand):
     error, link = largest_fk_error(hand, random_joints(hand, 200))
     assert error < 1e-6, link
-
-
-@pytest.mark.promise("N8")
-def test_fk_float32_within_a_micrometre(hand):
     joints = random_joints(hand, 500)
     points, normals = hand.fingertips(joints)
     points32, normals32 = hand.fingertips(joints.float())
     assert points32.dtype == torch.float32
-    torch.testing.assert_close(points32.double(), points, atol=1e-6, rtol=0)
-    torch.testing.assert_close(normals32.double(), normals, atol=2e-6, rtol=0)
+    near(points32.double(), points, 1e-6)
+    near(normals32.double(), normals, 2e-6)
 
 
 @pytest.mark.parametrize("given", [False, True], ids=["pads", "given points"])
@@ -70,26 +66,30 @@ def test_batch_equals_singles_and_keeps_its_shape(hand):
     assert points.shape == normals.shape == (2, 3, len(hand.finger_names), 3)
     assert hand.jacobian(joints).shape == (2, 3, len(hand.finger_names), 3, hand.dof)
     assert hand.self_clearance(joints).shape == (2, 3)
-    torch.testing.assert_close(points[1, 2], hand.fingertips(joints[1, 2])[0], atol=1e-12, rtol=0)
+    near(points[1, 2], hand.fingertips(joints[1, 2])[0], 1e-12)
     torch.testing.assert_close(hand.self_clearance(joints)[1, 2], hand.self_clearance(joints[1, 2]))
     empty = joints[:0]
     assert hand.fingertips(empty)[0].shape == (0, 3, len(hand.finger_names), 3)
     assert hand.self_clearance(empty).shape == (0, 3)
 
 
-def test_contact_lies_on_the_tips_sphere_along_the_normal(hand):
+def test_contact_lies_on_the_tips_sphere_along_the_normal_and_touching_spheres_are_tips(hand):
     joints = random_joints(hand, 50)
     points, normals = hand.fingertips(joints)
     radius = hand.tips.radius[:, None]
     torch.testing.assert_close(
         torch.linalg.vector_norm(normals, dim=-1), torch.ones(50, len(hand.finger_names), dtype=torch.float64)
     )
-    torch.testing.assert_close(hand.tip_centres(joints) + radius * normals, points, atol=1e-8, rtol=0)
+    near(hand.tip_centres(joints) + radius * normals, points, 1e-8)
+    cover = hand.collision_spheres
+    assert sorted(set(cover.link_index[cover.touching].tolist())) == sorted(hand.tips.index.tolist())
+    parked = {-2} if bool((hand.actuated.coupling == 0).all(1).any()) else set()  # a joint that nothing moves
+    assert set(cover.finger.tolist()) == {-1, *range(len(hand.finger_names))} | parked
 
 
 def test_expand_names_every_joint_and_couples_exactly():
     hand = load_hand("barrett")
-    joints = torch.tensor([1.0, 0.3, 0.6, 0.9], dtype=torch.float64)
+    joints = real([1.0, 0.3, 0.6, 0.9])
     q = hand.expand(joints)
     assert set(q) == set(hand.tree.joint_names)
     assert len(q) == 8
@@ -100,29 +100,24 @@ def test_expand_names_every_joint_and_couples_exactly():
     assert float(allegro["joint_9"]) == pytest.approx(-0.196)  # the ring finger is parked
 
 
-def test_barrett_is_the_published_hand():
+def test_barrett_is_the_published_hand_and_symmetric_left_to_right():
     hand = load_hand("barrett")
     poses = dict(zip(hand.tree.link_names, hand.link_poses(torch.zeros(4, dtype=torch.float64)), strict=True))
     expected = {"f1_dist": (-25.0, -119.94, 78.4), "f2_dist": (25.0, -119.94, 78.4), "f3_dist": (0.0, 119.94, 78.4)}
     for link, mm in expected.items():
-        torch.testing.assert_close(poses[link][:3, 3] * 1e3, torch.tensor(mm).double(), atol=1e-3, rtol=0)
+        near(poses[link][:3, 3] * 1e3, torch.tensor(mm).double(), 1e-3)
     # spread by half a turn brings fingers 1 and 2 to the side of finger 3
-    joints = torch.tensor([math.pi, 0.5, 0.5, 0.5], dtype=torch.float64)
+    joints = real([math.pi, 0.5, 0.5, 0.5])
     points, _ = hand.fingertips(joints)
     assert bool((points[:, 1] > 0.05).all())
-    torch.testing.assert_close(points[0, 1:], points[2, 1:], atol=1e-6, rtol=0)
-
-
-def test_barrett_is_symmetric_left_to_right():
-    hand = load_hand("barrett")
+    near(points[0, 1:], points[2, 1:], 1e-6)
     joints = random_joints(hand, 20)
     mirrored = joints[:, [0, 2, 1, 3]]
-    flip = torch.tensor([-1.0, 1, 1], dtype=torch.float64)
-    middle = torch.tensor([0.0, 0, 0.0006], dtype=torch.float64)  # the fingers' middle plane is 0.6 mm off their axis
-    points, _ = hand.fingertips(joints)
-    others, _ = hand.fingertips(mirrored)
-    torch.testing.assert_close(points[:, 2], others[:, 2] * flip, atol=2 * middle.norm().item() + 1e-6, rtol=0)
-    torch.testing.assert_close(points[:, 0], others[:, 1] * flip, atol=2 * middle.norm().item() + 1e-6, rtol=0)
+    flip = real([-1.0, 1, 1])
+    middle = real([0.0, 0, 0.0006])  # the fingers' middle plane is 0.6 mm off their axis
+    points, others = (hand.fingertips(q)[0] for q in (joints, mirrored))
+    near(points[:, 2], others[:, 2] * flip, 2 * middle.norm().item() + 1e-6)
+    near(points[:, 0], others[:, 1] * flip, 2 * middle.norm().item() + 1e-6)
 
 
 def test_allegro_thumb_opposes_the_fingers():
@@ -133,9 +128,7 @@ def test_allegro_thumb_opposes_the_fingers():
     cosines = (normals[:, :2] * normals[:, 2:]).sum(-1)
     assert float((cosines < -0.5).any(1).double().mean()) > 0.5
     extended, _ = hand.fingertips(torch.zeros(12, dtype=torch.float64))
-    torch.testing.assert_close(
-        extended[0, 1] - extended[1, 1], torch.tensor(0.0435 + 0.0126).double(), atol=2e-3, rtol=0
-    )
+    near(extended[0, 1] - extended[1, 1], torch.tensor(0.0435 + 0.0126).double(), 2e-3)
 
 
 def test_spheres_cover_the_collision_shapes(hand):
@@ -144,22 +137,15 @@ def test_spheres_cover_the_collision_shapes(hand):
         for shape in link.shapes:
             if shape.kind != "box":
                 continue
-            half = torch.tensor(shape.size, dtype=torch.float64) / 2
+            half = real(shape.size) / 2
             points = (2 * torch.rand(500, 3, generator=generator, dtype=torch.float64) - 1) * half
             side = torch.randint(3, (500,), generator=generator)
             points[torch.arange(500), side] = half[side]  # on the faces
-            points = points @ rotation_from_rpy(shape.rpy).T + torch.tensor(shape.xyz, dtype=torch.float64)
+            points = points @ rotation_from_rpy(shape.rpy).T + real(shape.xyz)
             mine = cover.link_index == index
             gap = (torch.cdist(points, cover.center[mine]) - cover.radius[mine]).amin(1)
             of_palm = bool((cover.finger[mine] == -1).all())
             assert float(gap.max()) < (0.009 if of_palm else 0.004), link.name
-
-
-def test_touching_spheres_are_the_tips(hand):
-    cover = hand.collision_spheres
-    assert sorted(set(cover.link_index[cover.touching].tolist())) == sorted(hand.tips.index.tolist())
-    parked = {-2} if bool((hand.actuated.coupling == 0).all(1).any()) else set()  # a joint that nothing moves
-    assert set(cover.finger.tolist()) == {-1, *range(len(hand.finger_names))} | parked
 
 
 @pytest.mark.promise("I13")
@@ -190,8 +176,8 @@ def test_tactile_fingertips_reach_23_mm_farther_and_change_nothing_else():
         tips = torch.linalg.inv(poses[[hand.tree.link_names.index(f"{f}_distal") for f in hand.tips.names]])
         centres = (tips @ poses[hand.tips.index])[:, :3, 3]
         reach.append(centres[:, 2] + hand.tips.radius)
-    torch.testing.assert_close(reach[0], torch.tensor([0.0387, 0.0387, 0.0543]).double(), rtol=0, atol=1e-6)
-    torch.testing.assert_close(reach[1], torch.tensor([0.0618, 0.0618, 0.0774]).double(), rtol=0, atol=2e-4)
+    near(reach[0], torch.tensor([0.0387, 0.0387, 0.0543]).double(), 1e-6)
+    near(reach[1], torch.tensor([0.0618, 0.0618, 0.0774]).double(), 2e-4)
     same = [name for name in stock.tree.link_names if not name.endswith("tip")]
     joints = 0.5 * (stock.lower + stock.upper)
     for name in same:

@@ -5,9 +5,9 @@ import pytest
 import torch
 from pytorch_kinematics import SerialChain, build_chain_from_urdf
 
-from torchgrasp.hand.hand import Hand
+from tests.make import near
+from torchgrasp import Hand, load_hand
 from torchgrasp.hand.kinematics import tree_from_urdf
-from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import random_joints, reference_poses
 
@@ -31,25 +31,32 @@ def hand(request) -> Hand:
 
 
 def assert_same_poses(found: torch.Tensor, truth: torch.Tensor) -> None:
-    torch.testing.assert_close(found, truth, atol=1e-6, rtol=0)  # [m], and entries of rotations
+    near(found, truth, 1e-6)  # [m], and entries of rotations
 
 
-def test_fk_equals_pytorch_kinematics_reading_the_file_itself(hand):
+def test_fk_equals_pytorch_kinematics_and_the_derivative_of_the_jacobian_is_symmetric(hand):
     """Its own reader keeps seven digits of an angle."""
     joints, chain = random_joints(hand, 100), build_chain_from_urdf(hand.urdf_path.read_bytes()).to(torch.float64)
     poses = chain.forward_kinematics(hand.expand(joints))
     assert_same_poses(hand.link_poses(joints), torch.stack([poses[n].get_matrix() for n in hand.tree.link_names], 1))
+    second = torch.func.jacfwd(hand.jacobian)(random_joints(hand, 1)[0])
+    near(second, second.mT, 1e-12)  # as second derivatives are
 
 
-def test_the_chain_is_pytorch_kinematics_own_and_goes_where_the_hand_goes(hand):
+def test_the_chain_is_pytorch_kinematics_own_and_keeps_dtype_and_place_of_the_hand(hand):
     joints = random_joints(hand, 3).requires_grad_()
     tip = hand.tips.links[0]
     found = hand.chain.forward_kinematics(hand.expand(joints))[tip].get_matrix()
-    torch.testing.assert_close(found, hand.link_poses(joints)[:, hand.tree.link_names.index(tip)], atol=1e-8, rtol=0)
+    near(found, hand.link_poses(joints)[:, hand.tree.link_names.index(tip)], 1e-8)
     assert torch.autograd.grad(found.sum(), joints)[0].abs().max() > 0
     serial = SerialChain(hand.chain, tip, dtype=torch.float64)
     assert serial.jacobian(torch.zeros(2, serial.n_joints, dtype=torch.float64)).shape == (2, 6, serial.n_joints)
     assert hand.to(torch.float32).chain.dtype == torch.float32
+    joints = random_joints(hand, 3)
+    moved = hand.to(torch.float32)
+    assert moved.tree.tables.dtype == torch.float32
+    near(moved.link_poses(joints.float()), hand.link_poses(joints.float()), 1e-7)
+    assert hand.link_poses(joints[0]).shape == (len(hand.tree.link_names), 4, 4)
 
 
 def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand):
@@ -73,7 +80,7 @@ def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand):
             twist = torch.from_numpy(pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED))
             arm = torch.from_numpy(data.oMf[frame].rotation) @ hand.tips.contact[finger]
             moved = twist[:3] + torch.linalg.cross(twist[3:], arm[:, None].expand(3, len(q)), dim=0)
-            torch.testing.assert_close(found[row, finger], moved @ hand.actuated.coupling[column], atol=1e-12, rtol=0)
+            near(found[row, finger], moved @ hand.actuated.coupling[column], 1e-12)
     assert_same_poses(hand.link_poses(joints), truth)
     assert float((hand.link_poses(joints) - truth).abs().max()) < 1e-12
 
@@ -85,11 +92,6 @@ def test_fk_is_differentiable_twice():
         assert torch.autograd.gradgradcheck(action, joints)
 
 
-def test_derivative_of_the_jacobian_is_symmetric(hand):
-    second = torch.func.jacfwd(hand.jacobian)(random_joints(hand, 1)[0])
-    torch.testing.assert_close(second, second.mT, atol=1e-12, rtol=0)  # as second derivatives are
-
-
 def test_a_tree_of_every_kind_of_joint_is_that_of_pytorch_kinematics(tmp_path, generator):
     path = tmp_path / "hand.urdf"
     path.write_text(BRANCHED)
@@ -99,11 +101,3 @@ def test_a_tree_of_every_kind_of_joint_is_that_of_pytorch_kinematics(tmp_path, g
     values = torch.randn(50, 4, generator=generator, dtype=torch.float64)
     assert float((tree.poses(values) - reference_poses(urdf, values)).abs().max()) < 1e-8
     assert torch.autograd.gradgradcheck(tree.poses, values[:1].requires_grad_())
-
-
-def test_kinematics_keeps_dtype_and_follows_the_hand(hand):
-    joints = random_joints(hand, 3)
-    moved = hand.to(torch.float32)
-    assert moved.tree.tables.dtype == torch.float32
-    torch.testing.assert_close(moved.link_poses(joints.float()), hand.link_poses(joints.float()), atol=1e-7, rtol=0)
-    assert hand.link_poses(joints[0]).shape == (len(hand.tree.link_names), 4, 4)

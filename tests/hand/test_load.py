@@ -9,11 +9,17 @@ from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import find_hand, hands_folder, load_hand
 
 
-def test_a_hand_is_found_by_name_folder_and_file():
+def test_a_hand_is_found_by_name_folder_and_file_and_unknown_ones_are_named(tmp_path):
     folder = hands_folder() / "barrett"
     for given in ("barrett", folder, str(folder), folder / "hand.toml"):
         assert find_hand(given) == folder
     assert load_hand(folder).source.sha256 == load_hand("barrett").source.sha256
+    with pytest.raises(HandFileError, match=r"allegro.*barrett"):
+        load_hand("fist")
+    with pytest.raises(HandFileError, match=r"hand\.toml"):
+        load_hand(tmp_path)
+    with pytest.raises(BadArgument, match="paper_literal"):
+        load_hand("allegro", "thumbs")
 
 
 def test_a_shipped_name_that_is_a_folder_here_is_refused(tmp_path, monkeypatch):
@@ -24,15 +30,6 @@ def test_a_shipped_name_that_is_a_folder_here_is_refused(tmp_path, monkeypatch):
     assert find_hand("./leap").resolve() == tmp_path / "leap" == find_hand(tmp_path / "leap")
     monkeypatch.chdir(hands_folder())
     assert find_hand("leap") == hands_folder() / "leap"
-
-
-def test_unknown_hand_and_option_are_named(tmp_path):
-    with pytest.raises(HandFileError, match=r"allegro.*barrett"):
-        load_hand("fist")
-    with pytest.raises(HandFileError, match=r"hand\.toml"):
-        load_hand(tmp_path)
-    with pytest.raises(BadArgument, match="paper_literal"):
-        load_hand("allegro", "thumbs")
 
 
 @pytest.mark.parametrize(

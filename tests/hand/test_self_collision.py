@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from torchgrasp import Hand, load_hand
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.hand.collision_shapes import MEETING_DISTANCE, collision_pairs, self_collision_from_urdf
-from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.kinematics import tree_from_urdf
-from torchgrasp.hand.load import load_hand
 from torchgrasp.hand.urdf import Mimic, read_urdf
 from torchgrasp.testing import check_hand, random_joints
 
@@ -43,7 +42,7 @@ def test_self_collision_agrees_with_exact_hulls(hand):
     assert (found[~met & ~wrong] >= truth[~met & ~wrong] / 3**0.5 - 1e-3).all()
 
 
-def test_clearance_is_the_least_of_all_pairs(hand):
+def test_clearance_is_the_least_of_all_pairs_in_float32_too(hand):
     joints = random_joints(hand, 500)
     every = hand.self_collision.separations(frames_of(hand, joints), torch.inf)
     torch.testing.assert_close(hand.self_clearance(joints), every.amin(0), atol=1e-14, rtol=0)
@@ -53,9 +52,6 @@ def test_clearance_is_the_least_of_all_pairs(hand):
         torch.testing.assert_close(found.clamp_max(below), every.amin(0).clamp_max(below), atol=1e-14, rtol=0)
     near = hand.self_collision.separations(frames_of(hand, joints), 0.002)
     torch.testing.assert_close(near.clamp_max(0.002), every.clamp_max(0.002), atol=1e-14, rtol=0)
-
-
-def test_clearance_in_float32_is_that_in_float64(hand):
     joints = random_joints(hand, 500).float()
     found = hand.self_clearance(joints)
     assert found.dtype == torch.float32
@@ -106,16 +102,13 @@ def test_pairs_of_the_shipped_hands_are_the_learned_ones(name):
     assert list(spec.pairs) == sorted(spec.pairs, key=lambda pair: [hand.tree.link_names.index(x) for x in pair])
 
 
-def test_neighbours_and_links_that_always_or_never_meet_are_no_pairs(toy_hand):
+def test_links_that_always_or_never_meet_are_no_pairs_and_a_hand_without_any_is_always_clear(toy_hand):
     urdf = read_urdf(toy_hand / "hand.urdf")
     assert collision_pairs(urdf, {}, n=50) == [("t1", "t2"), ("t2", "t3")] or collision_pairs(urdf, {}, n=50) == []
     with pytest.raises(BadArgument, match=r"coupling: expected .*got j9"):
         collision_pairs(urdf, {"j9": Mimic("j1", 1.0, 0.0)}, n=50)
     with pytest.raises(BadArgument, match=r"n: expected .*got 0"):
         collision_pairs(urdf, {}, n=0)
-
-
-def test_a_hand_without_pairs_is_always_clear(toy_hand):
     text = (toy_hand / "hand.toml").read_text()
     (toy_hand / "hand.toml").write_text(text.replace("[options", "[self_collision]\npairs = []\n[options", 1))
     hand = check_hand(toy_hand)

@@ -25,9 +25,18 @@ def write(tmp_path: Path, text: str | bytes) -> Path:
     return path
 
 
-def test_a_small_tree_is_read(tmp_path):
+def test_a_tree_is_read_and_too_large_and_missing_files_are_refused(tmp_path):
     urdf = read_urdf(write(tmp_path, GOOD))
     assert (urdf.root, [j.name for j in urdf.joints], [x.name for x in urdf.links]) == ("a", ["j"], ["a", "b"])
+    chain = JOINT + JOINT.replace('"j"', '"k"').replace('"b"', '"c"').replace('"a"', '"b"')
+    urdf = read_urdf(write(tmp_path, GOOD.replace(LINKS + JOINT, LINKS + '<link name="c"/>' + chain)))
+    assert [[j.name for j in urdf.joints_above(x)] for x in "abc"] == [[], ["j"], ["k", "j"]]
+    with pytest.raises(HandFileError, match="bytes"):
+        read_urdf(write(tmp_path, GOOD + " " * URDF_BYTES))
+    with pytest.raises(HandFileError, match="no file"):
+        read_urdf(tmp_path / "none.urdf")
+    with pytest.raises(HandFileError, match="no file"):
+        read_urdf(tmp_path)
 
 
 BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>'
@@ -132,18 +141,3 @@ def test_angles_come_back_as_they_stand_in_the_file(tmp_path, rpy):
     found = Rotation.from_euler("xyz", read_urdf(write(tmp_path, text)).joints[0].rpy)
     truth = Rotation.from_euler("xyz", [float(x) for x in rpy.split()])
     assert (found.inv() * truth).magnitude() < 1e-14
-
-
-def test_joints_above_a_link_lead_to_the_root(tmp_path):
-    chain = JOINT + JOINT.replace('"j"', '"k"').replace('"b"', '"c"').replace('"a"', '"b"')
-    urdf = read_urdf(write(tmp_path, GOOD.replace(LINKS + JOINT, LINKS + '<link name="c"/>' + chain)))
-    assert [[j.name for j in urdf.joints_above(x)] for x in "abc"] == [[], ["j"], ["k", "j"]]
-
-
-def test_too_large_and_missing_files_are_refused(tmp_path):
-    with pytest.raises(HandFileError, match="bytes"):
-        read_urdf(write(tmp_path, GOOD + " " * URDF_BYTES))
-    with pytest.raises(HandFileError, match="no file"):
-        read_urdf(tmp_path / "none.urdf")
-    with pytest.raises(HandFileError, match="no file"):
-        read_urdf(tmp_path)

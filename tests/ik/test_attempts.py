@@ -8,17 +8,15 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tests.make import field_of_mesh
+from tests.make import field_of_mesh, real
+from torchgrasp import load_hand, load_mixture
 from torchgrasp.base import Batch
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply
-from torchgrasp.hand.load import load_hand
+from torchgrasp.ik import CollisionWorld, GraspProblem
 from torchgrasp.ik.attempts import Attempts, assign, solve_contact_first
-from torchgrasp.ik.candidates import GraspProblem
-from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.seeds import query_mixture
-from torchgrasp.posture_model.mixture import load_mixture
 from torchgrasp.values import Certificate, Contacts, IKSeeds
 
 
@@ -52,7 +50,7 @@ def solves(outcome: Outcome) -> Tensor:
     return outcome.status == Status.OK
 
 
-def test_later_rounds_refine_only_seeds_of_unsolved_triples():
+def test_later_rounds_refine_only_unsolved_triples_and_the_best_is_a_success_or_the_least_error():
     refined = []
     seeds = seeds_of([0, 0, 0, 1, 1, 1, 2], [5.0, -1.0, -2.0, 4.0, 3.0, -6.0, -7.0])
     attempts = Attempts(torch.tensor([True, True, False, True]), solves)
@@ -62,9 +60,6 @@ def test_later_rounds_refine_only_seeds_of_unsolved_triples():
     attempts.refine(seeds, rank_in_group(seeds.row), [3], by_sign(refined))  # another refinement starts anew
     assert refined[2:] == [[4.0, 3.0, -6.0]]
     assert attempts.unsolved.tolist() == [False, False, False, True]
-
-
-def test_the_best_of_each_triple_is_a_success_else_the_least_error():
     attempts = Attempts(torch.ones(3, dtype=torch.bool), solves)
     seeds = seeds_of([0, 0, 0, 1, 1], [2.0, -9.0, -8.0, 4.0, 3.0])
     attempts.refine(seeds, rank_in_group(seeds.row), [5], by_sign([]))
@@ -96,7 +91,7 @@ def test_grasps_are_checked_and_ranked():
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.035)
     turn = torch.linspace(0, 1.5, 6, dtype=torch.float64)
     flat = torch.full((6, 3), 0.001, dtype=torch.float64)
-    angle = turn[:, None] + torch.tensor([0.0, 2.1, 4.2], dtype=torch.float64)
+    angle = turn[:, None] + real([0.0, 2.1, 4.2])
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
     contacts = Contacts(0.035 * normals, normals, std_m=flat)
     ones = torch.ones(6, dtype=torch.float64)

@@ -5,11 +5,10 @@ import math
 import pytest
 import torch
 
-from tests.make import field_of_mesh
+from tests.make import distance_field, field_of_mesh
 from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import APPROACH_DISTANCE, FINE_STEPS, approach_directions, find_approach
@@ -39,19 +38,9 @@ def test_the_path_is_as_clear_of_the_object_and_the_table_as_said(name):
     assert float(direction.norm()) == pytest.approx(1.0)
     centres, radius = spheres_on_path(posture, hand, direction)
     away = centres[: 81 - 5]  # the last sixteenth is the pre-grasp's own matter
-    least = min(
-        float((cylinder_distance(away) - radius).min()),
-        float((away[..., 2] - radius).min()),
-    )
+    least = min(float((cylinder_distance(away) - radius).min()), float((away[..., 2] - radius).min()))
     assert least > 0
     assert float(clearance) == pytest.approx(least, abs=5e-4)
-
-
-def field_of(distance, center, half=0.4, spacing=0.01):
-    """A field of a distance in closed form around a centre."""
-    axis = torch.arange(-half, half, spacing, dtype=torch.float64)
-    offsets = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    return SignedDistanceField(center - half, spacing, distance(offsets + center))
 
 
 def test_a_wall_is_avoided_and_a_cage_leaves_no_path():
@@ -63,7 +52,7 @@ def test_a_wall_is_avoided_and_a_cage_leaves_no_path():
         """Distance to all that is more than 0.1 m behind the hand on that path."""
         return ((points - center) * free[0]).sum(-1) + 0.1
 
-    other, clearance = find_approach(hand, posture, CollisionWorld(field_of(wall, center), None))
+    other, clearance = find_approach(hand, posture, CollisionWorld(distance_field(wall, center, 0.4, 0.01), None))
     before = (wall(spheres_on_path(posture, hand, free)[0]) - hand.collision_spheres.radius).min()
     after = (wall(spheres_on_path(posture, hand, other)[0][:-5]) - hand.collision_spheres.radius).min()
     assert float(after) > float(before) + 0.02
@@ -73,7 +62,7 @@ def test_a_wall_is_avoided_and_a_cage_leaves_no_path():
         """Distance to all that is more than 0.15 m from the middle of the hand."""
         return 0.15 - (points - center).norm(dim=-1)
 
-    _, none = find_approach(hand, posture, CollisionWorld(field_of(cage, center), None))
+    _, none = find_approach(hand, posture, CollisionWorld(distance_field(cage, center, 0.4, 0.01), None))
     assert float(none) < 0
 
 
@@ -97,7 +86,7 @@ def test_the_path_turns_with_hand_and_frame():
         rotation = turned.obj_from_hand[0, :3, :3]
         middle = apply(turned.obj_from_hand[0], 0.1 * axis[None])[0]
         wall = wall_of(rotation @ leaning, middle - 0.25 * (rotation @ leaning))
-        field = field_of(wall, middle, half=0.35, spacing=0.005)
+        field = distance_field(wall, middle, 0.35, 0.005)
         direction, clearance = find_approach(hand, turned, CollisionWorld(field, None))
         assert torch.allclose(direction[0], rotation @ tilted, atol=1e-12)
         centres, radius = spheres_on_path(turned, hand, direction)
@@ -118,7 +107,7 @@ def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
         directions = approach_directions(hand, posture, None)[0]
         paths = [spheres_on_path(posture, hand, d[None], FINE_STEPS + 1)[0][:-1] for d in directions]
         room = torch.stack([(wall_of(normal, middle)(path) - radius).min() for path in paths])
-        field = field_of(wall_of(normal, middle + (room.max() - 1e-3) * normal), middle, half=0.42, spacing=0.03)
+        field = distance_field(wall_of(normal, middle + (room.max() - 1e-3) * normal), middle, 0.42, 0.03)
         by_node = torch.stack([(field.nearest_node(path) - radius).min() for path in paths]).argmax()
         erred += int(room[by_node] < room.max() - 1e-3)
         direction, clearance = find_approach(hand, posture, CollisionWorld(field, None))

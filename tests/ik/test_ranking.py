@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests.make import near, real
 from tests.pinch import pinch
+from torchgrasp import ContactSpec, closure_probability, fit_shape
 from torchgrasp.base import join
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
@@ -23,18 +25,15 @@ from torchgrasp.ik.ranking import (
     success_features,
     success_log_odds,
 )
-from torchgrasp.plan.closure_probability import closure_probability
-from torchgrasp.shape.fit import fit_shape
-from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Contacts, PointCloud, format_success
 
-PADS = torch.tensor([[0.1, 0.3, 0.2]], dtype=torch.float64)
+PADS = real([[0.1, 0.3, 0.2]])
 GOOD = torch.tensor([[4.0, 0.3, -1.0, -0.2]])
 WORSE = {"log-odds of closure": -2.0, "log of the stiffest finger's lever over 70 mm, at most": -0.5}
 RADIUS = 0.04
 
 
-def test_rank_in_group_against_brute_force(generator):
+def test_rank_in_group_against_brute_force_and_centred_friction_is_the_tangent_of_the_tilt(generator):
     cost = torch.randint(0, 40, (200,), generator=generator).double()  # with ties
     group = torch.randint(0, 30, (200,), generator=generator)
     place, counts = torch.zeros(200, dtype=torch.int64), {}
@@ -43,43 +42,45 @@ def test_rank_in_group_against_brute_force(generator):
         counts[int(group[i])] = int(place[i]) + 1
     assert torch.equal(rank_in_group(group, cost), place)
     assert len(rank_in_group(group[:0], cost[:0])) == 0
+    near(centred_friction(triple(tilt=0.0)), torch.zeros(1, dtype=torch.float64), 1e-6)
+    near(centred_friction(triple(tilt=0.3)), real([0.3]).tan(), 1e-6)
 
 
 def triple(height: float = 0.0, tilt: float = 0.0) -> Contacts:
     """Three contacts on a vertical cylinder at 120 degrees, normals tilted upward."""
     angle = torch.arange(3, dtype=torch.float64) * 2 * math.pi / 3
     radial = torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)
-    up = torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    up = real([0.0, 0, 1])
     normals = torch.cos(torch.tensor(tilt)) * radial + torch.sin(torch.tensor(tilt)) * up
     return Contacts((0.03 * radial + height * up)[None], normals[None])
 
 
-def test_centred_friction_is_the_tangent_of_the_tilt():
-    torch.testing.assert_close(
-        centred_friction(triple(tilt=0.0)), torch.zeros(1, dtype=torch.float64), atol=1e-6, rtol=0
-    )
-    torch.testing.assert_close(
-        centred_friction(triple(tilt=0.3)), torch.tensor([0.3], dtype=torch.float64).tan(), atol=1e-6, rtol=0
-    )
-
-
-def test_more_contacts_carry_a_load_as_the_best_three_do(generator):
+def test_the_arm_of_a_load_is_about_the_longest_side_of_the_best_three_in_any_frame_or_order(generator):
     points = torch.randn(20, 5, 3, generator=generator, dtype=torch.float64)
-    center = torch.tensor([0.5, 0.1, -0.3], dtype=torch.float64)
+    center = real([0.5, 0.1, -0.3])
     threes = torch.stack([load_arm(points[:, list(k)], center) for k in itertools.combinations(range(5), 3)])
     assert torch.equal(load_arm(points, center), threes.amin(0))
     assert bool((load_arm(points, center) <= load_arm(points[:, :4], center)).all())
+    points = 0.05 * torch.randn(30, 3, 3, generator=generator, dtype=torch.float64)
+    center = real([0.01, -0.02, 0.015])
+    found = load_arm(points, center)
+    for row in range(10):
+        p = points[row].numpy()
+        first, second, third = max(((0, 1, 2), (1, 2, 0), (2, 0, 1)), key=lambda s: np.linalg.norm(p[s[0]] - p[s[1]]))
+        side = p[second] - p[first]
+        gaps = [np.linalg.norm(np.cross(side, x - p[first])) / np.linalg.norm(side) for x in (center.numpy(), p[third])]
+        assert float(found[row]) == pytest.approx(gaps[0] / (gaps[1] + 0.01))
+    turn = rotation_from_vector(real([0.3, -1.0, 2.0]))
+    torch.testing.assert_close(load_arm(points[:, [2, 0, 1]] @ turn.T + 1.0, turn @ center + 1.0), found)
+    assert load_arm(points[:0], center).shape == (0,)
 
 
 @pytest.mark.parametrize("name", FEATURES)
 @pytest.mark.parametrize("hand", ["allegro", "barrett"])
-def test_every_feature_counts_the_way_it_should(name, hand):
+def test_every_feature_counts_the_way_it_should_and_an_unknown_hand_gets_the_least_chance(name, hand):
     changed = GOOD.clone()
     changed[0, FEATURES.index(name)] += WORSE.get(name, 0.5)
     assert float(success_log_odds(changed, hand) - success_log_odds(GOOD, hand)) < -0.1
-
-
-def test_a_hand_that_the_model_does_not_know_gets_the_least_chance():
     known = [success_log_odds(GOOD, hand) for hand in ("allegro", "barrett")]
     assert float(success_log_odds(GOOD, "mine")) == min(map(float, known))
 
@@ -108,9 +109,9 @@ def ball():
 
 def around(height=0.0):
     """Contacts around z at a height [m] on the ball."""
-    angle = torch.tensor([0.3, 2.4, 4.6], dtype=torch.float64)
+    angle = real([0.3, 2.4, 4.6])
     level = math.sqrt(RADIUS**2 - height**2) * torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)
-    points = level + torch.tensor([0.0, 0.0, height], dtype=torch.float64)
+    points = level + real([0.0, 0.0, height])
     return Contacts(points[None], unit(points)[None])
 
 
@@ -147,7 +148,7 @@ def test_equal_springs_in_all_joints_yield_by_the_square_of_the_lever(name):
 
 
 def test_features_of_a_ball_by_hand(ball):
-    contacts, center = around(0.01), torch.tensor([0.0, 0.0, -0.02], dtype=torch.float64)
+    contacts, center = around(0.01), real([0.0, 0.0, -0.02])
     hand, grasp = held(contacts)
     closure, least, arm, lever = success_features(hand, ball, grasp, center, 0.5, seed=3)[0].tolist()
     cone = math.atan(0.5)
@@ -161,34 +162,19 @@ def test_features_of_a_ball_by_hand(ball):
     assert lever == pytest.approx(math.log((min(float(finger_levers(hand, grasp).min()), 0.07) + 0.01) / 0.08))
 
 
-def test_the_arm_of_a_load_is_about_the_longest_side_and_no_frame_or_order_matters(generator):
-    points = 0.05 * torch.randn(30, 3, 3, generator=generator, dtype=torch.float64)
-    center = torch.tensor([0.01, -0.02, 0.015], dtype=torch.float64)
-    found = load_arm(points, center)
-    for row in range(10):
-        p = points[row].numpy()
-        first, second, third = max(((0, 1, 2), (1, 2, 0), (2, 0, 1)), key=lambda s: np.linalg.norm(p[s[0]] - p[s[1]]))
-        side = p[second] - p[first]
-        gaps = [np.linalg.norm(np.cross(side, x - p[first])) / np.linalg.norm(side) for x in (center.numpy(), p[third])]
-        assert float(found[row]) == pytest.approx(gaps[0] / (gaps[1] + 0.01))
-    turn = rotation_from_vector(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
-    torch.testing.assert_close(load_arm(points[:, [2, 0, 1]] @ turn.T + 1.0, turn @ center + 1.0), found)
-    assert load_arm(points[:0], center).shape == (0,)
-
-
 def test_features_do_not_depend_on_the_frame_and_rows_do_not_on_each_other(ball):
-    turn = rotation_from_vector(torch.tensor([0.5, 1.0, -2.0], dtype=torch.float64))
-    moved_from_obj = rigid(turn, torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64))
-    center = torch.tensor([0.0, 0.01, 0.0], dtype=torch.float64)
+    turn = rotation_from_vector(real([0.5, 1.0, -2.0]))
+    moved_from_obj = rigid(turn, real([0.3, -0.1, 0.2]))
+    center = real([0.0, 0.01, 0.0])
     both = Contacts(*(torch.cat([x, y]) for x, y in zip(tensors(around(0.01)), tensors(around(-0.02)), strict=True)))
     hand, grasps = held(both)
     here = success_features(hand, ball, grasps, center, 0.6)
     there = Contacts(apply(moved_from_obj, both.points), both.normals @ turn.T)
     moved, at = held(there, moved_from_obj)[1], apply(moved_from_obj, center[None])[0]
     again = success_features(hand, ball.moved(moved_from_obj), moved, at, 0.6)
-    torch.testing.assert_close(again[:, 1:], here[:, 1:], atol=1e-3, rtol=0)
-    torch.testing.assert_close(torch.sigmoid(again[:, 0]), torch.sigmoid(here[:, 0]), atol=0.06, rtol=0)  # other draws
-    torch.testing.assert_close(success_features(hand, ball, grasps[1:], center, 0.6), here[1:], atol=1e-9, rtol=0)
+    near(again[:, 1:], here[:, 1:], 1e-3)
+    near(torch.sigmoid(again[:, 0]), torch.sigmoid(here[:, 0]), 0.06)  # other draws
+    near(success_features(hand, ball, grasps[1:], center, 0.6), here[1:], 1e-9)
     assert success_features(hand, ball, grasps[:0], center, 0.6).shape == (0, len(FEATURES))
 
 

@@ -5,18 +5,16 @@ import dataclasses
 import pytest
 import torch
 
-from tests.make import touched_contacts
+from tests.make import near, real, touched_contacts
+from torchgrasp import Contacts, Plane, load_hand
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
-from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import field_from_surface
-from torchgrasp.hand.load import load_hand
 from torchgrasp.ik.candidates import is_clear, measure_errors
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
 from torchgrasp.ik.motion import find_approach
 from torchgrasp.ik.refine import grasp_residuals, open_hand, refine, tip_rows, tip_targets
-from torchgrasp.values import Contacts
 
 
 @pytest.fixture(scope="module", params=["allegro", "barrett"])
@@ -107,7 +105,7 @@ def test_errors_name_what_is_wrong(hand, ball):
     posture = random_postures(hand, 60)
     free = hand.self_clearance(posture.joints) > 0
     posture = Configuration(posture.joints[free], posture.obj_from_hand[free])
-    away = torch.tensor([0.0, 0, 1.0], dtype=torch.float64)
+    away = real([0.0, 0, 1.0])
     posture = Configuration(
         posture.joints, rigid(posture.obj_from_hand[:, :3, :3], posture.obj_from_hand[:, :3, 3] + away)
     )
@@ -118,10 +116,7 @@ def test_errors_name_what_is_wrong(hand, ball):
     shifted = Contacts(contacts.points + 0.003, contacts.normals)
     assert (measure_errors(hand, posture, shifted, far(ball)).status == Status.TIP_ERROR).all()
 
-    inside_out = Contacts(
-        contacts.points - 2 * hand.tips.radius[:, None] * -contacts.normals,
-        -contacts.normals,
-    )
+    inside_out = Contacts(contacts.points - 2 * hand.tips.radius[:, None] * -contacts.normals, -contacts.normals)
     assert (measure_errors(hand, posture, inside_out, far(ball)).status == Status.NORMAL_ANGLE).all()
 
     below = measure_errors(hand, posture, contacts, CollisionWorld(ball, 2.0))
@@ -189,9 +184,7 @@ def test_a_tilted_table_is_a_level_one_seen_from_another_frame(hand, ball):
         )
         torch.testing.assert_close(a, b, atol=1e-9, rtol=1e-9)
     torch.testing.assert_close(link_clearance(here, level, True)[2], link_clearance(there, tilted, True)[2])
-    torch.testing.assert_close(
-        open_hand(hand, posture, contacts, level), open_hand(hand, moved, turned, tilted), atol=1e-6, rtol=0
-    )
+    near(open_hand(hand, posture, contacts, level), open_hand(hand, moved, turned, tilted), 1e-6)
     (direction, room), (other, same) = (find_approach(hand, p, w) for p, w in ((posture, level), (moved, tilted)))
     torch.testing.assert_close(rotate(turn, direction[:, None])[:, 0], other)
     torch.testing.assert_close(room, same)

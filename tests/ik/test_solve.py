@@ -3,18 +3,13 @@
 import pytest
 import torch
 
-from tests.make import touched_contacts
+from tests.make import near, real, touched_contacts
+from torchgrasp import Contacts, load_hand, load_mixture, sample_configurations, solve_ik
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
-from torchgrasp.hand.load import load_hand
+from torchgrasp.ik import CollisionWorld, PostureLibrary
 from torchgrasp.ik.attempts import refine_by_cobyla
-from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.seeds import PostureLibrary
-from torchgrasp.ik.solve import solve_ik
-from torchgrasp.posture_model.mixture import load_mixture
-from torchgrasp.posture_model.sample import sample_configurations
-from torchgrasp.values import Contacts
 
 
 def four_fingers():
@@ -31,7 +26,7 @@ def test_contacts_of_four_fingers_are_solved_in_any_order():
     solution = solve_ik(hand, contacts, library=library)
     assert float((solution.status == Status.OK).double().mean()) >= 0.9
     solved = solution.status == Status.OK
-    torch.testing.assert_close(solution.tip_error, miss(hand, solution, contacts), atol=1e-9, rtol=0)
+    near(solution.tip_error, miss(hand, solution, contacts), 1e-9)
     assert float(solution.tip_error[solved].max()) < 1e-3
     assert bool((solution.permutation.sort(1).values == torch.arange(4)).all())
     for options, word in (({"method": "cobyla"}, "method"), ({"mixture": load_mixture("allegro")}, "mixture")):
@@ -62,7 +57,7 @@ def test_codes_of_real_postures_are_solved(scene, learned):
     hand, mixture, library, contacts = scene
     solution = solve_ik(hand, contacts, mixture if learned else None, library=library)
     assert (solution.status == Status.OK).all()
-    torch.testing.assert_close(solution.tip_error, miss(hand, solution, contacts), atol=1e-9, rtol=0)
+    near(solution.tip_error, miss(hand, solution, contacts), 1e-9)
     assert float(solution.tip_error.max()) < 1e-3
     assert float(solution.tip_error.amax(1).median()) < 5e-5
     assert bool((hand.self_clearance(solution.joints) >= 0).all())
@@ -74,24 +69,24 @@ def test_codes_of_real_postures_are_solved(scene, learned):
 
 def test_the_frame_of_the_contacts_does_not_matter(scene):
     hand, mixture, library, contacts = scene
-    turn = rotation_from_vector(torch.tensor([0.4, -1.0, 2.0], dtype=torch.float64))
-    move = rigid(turn, torch.tensor([0.5, -0.2, 0.1], dtype=torch.float64))
+    turn = rotation_from_vector(real([0.4, -1.0, 2.0]))
+    move = rigid(turn, real([0.5, -0.2, 0.1]))
     some = contacts[:6]
     moved = Contacts(apply(move, some.points), rotate(move, some.normals))
     here, there = (solve_ik(hand, x, mixture, library=library) for x in (some, moved))
-    torch.testing.assert_close(here.joints, there.joints, atol=1e-6, rtol=0)
-    torch.testing.assert_close(move @ here.obj_from_hand, there.obj_from_hand, atol=1e-6, rtol=0)
+    near(here.joints, there.joints, 1e-6)
+    near(move @ here.obj_from_hand, there.obj_from_hand, 1e-6)
 
 
 def test_cobyla_moves_pose_and_joints_until_the_contact_points_meet():
     hand = load_hand("barrett")
-    true = torch.tensor([[0.3, 0.9, 1.0, 0.8], [0.1, 1.2, 0.6, 1.0]], dtype=torch.float64)
+    true = real([[0.3, 0.9, 1.0, 0.8], [0.1, 1.2, 0.6, 1.0]])
     points, normals = hand.fingertips(true)
     contacts, nowhere = Contacts(points, -normals), torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
     solution = refine_by_cobyla(hand, Configuration(true + 0.05, nowhere), contacts, CollisionWorld())
     tips = hand.fingertips(solution.joints)[0]
     assert float((apply(solution.obj_from_hand, tips) - points).norm(dim=-1).max()) < 1e-4
-    torch.testing.assert_close(solution.obj_from_hand @ virtual_frame(tips), virtual_frame(points), atol=1e-9, rtol=0)
+    near(solution.obj_from_hand @ virtual_frame(tips), virtual_frame(points), 1e-9)
     hand.check_joints(solution.joints)
     by_name = solve_ik(hand, contacts[:1], load_mixture("barrett"), method="cobyla")
     assert by_name.status[0] == Status.OK

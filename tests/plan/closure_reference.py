@@ -8,12 +8,11 @@ contact. The normal is that of the mean's gradient there, plus the deviation ove
 import torch
 from torch import Tensor
 
+from torchgrasp import Contacts, ShapeGP
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import closed_exact, tangents
 from torchgrasp.plan.closure_probability import FOOTPRINT
-from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import distance_covariance
-from torchgrasp.values import Contacts
 
 GRID_POINTS = 37
 """Points of a line, over 12 standard deviations to either side: the deviations grow away from what was seen."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.make import half_ball as ball
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp import ShapeGP
 from torchgrasp.shape.values import SurfaceJet
 
 

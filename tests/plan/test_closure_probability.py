@@ -4,20 +4,16 @@ import pytest
 import torch
 
 from tests.make import HALF_BALL_RADIUS as RADIUS
-from tests.make import contacts_on
+from tests.make import contacts_on, near, spokes
 from tests.make import half_ball as ball
 from tests.plan.closure_reference import redrawn_closure
+from torchgrasp import Contacts, ContactSpec, closure_probability
 from torchgrasp.errors import BadArgument
-from torchgrasp.plan.closure_probability import closure_probability
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Contacts
 
 
 def test_a_sure_shape_is_sure_to_be_closed():
     shape = ball(-2.0, std_factor=0.1)
-    angle = torch.tensor([0.1, 2.2, 4.3], dtype=torch.float64)
-    corners = torch.stack([angle.cos(), angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)[None]
-    contacts = Contacts(RADIUS * corners, corners)
+    contacts = Contacts(RADIUS * spokes(), spokes())
     found = closure_probability(shape, contacts)
     assert float(found.probability) > 0.999
     assert 0.0 < float(found.standard_error) < 1e-3
@@ -26,13 +22,26 @@ def test_a_sure_shape_is_sure_to_be_closed():
         assert float(none.probability) < 0.02
 
 
-def test_the_probability_is_a_share_with_a_bounded_error(doubtful, generator):
+def test_the_probability_is_a_share_with_a_bounded_error_and_bad_arguments_are_named(doubtful, generator):
     contacts = contacts_on(doubtful, generator, 100)
     for friction in (0.5, 1.0):
         found = closure_probability(doubtful, contacts, ContactSpec(friction=friction), n=1000)
         assert float(found.standard_error.max()) <= 0.5 / 1000**0.5
         assert bool(((found.probability >= 0) & (found.probability <= 1)).all())
     assert 0.5 < float(found.probability.mean()) < 0.99
+    contacts = contacts_on(doubtful, generator, 2)
+    far = Contacts(contacts.points * 100, contacts.normals)
+    two = Contacts(contacts.points[:, :2], contacts.normals[:, :2])
+    long = Contacts(contacts.points, 1.1 * contacts.normals)
+    for wrong, options, match in (
+        (contacts, {"n": 0}, "n: expected .*got 0"),
+        (contacts, {"seed": -1}, "seed: expected .*got -1"),
+        (far, {}, "domain"),
+        (long, {}, "unit vectors"),
+        (two, {}, "expected 3 to 5.*got 2 contacts a row"),
+    ):
+        with pytest.raises(BadArgument, match=match):
+            closure_probability(doubtful, wrong, **options)
 
 
 @pytest.mark.parametrize(("fingertips", "friction"), [(3, 0.6), (4, 0.3)])
@@ -51,21 +60,5 @@ def test_rows_do_not_depend_on_each_other_and_a_seed_fixes_every_bit(doubtful, g
     assert torch.equal(every.probability, again.probability)
     assert not torch.equal(every.probability, other.probability)
     some = closure_probability(doubtful, contacts[[4, 11]], n=300, seed=3)
-    torch.testing.assert_close(some.probability, every.probability[[4, 11]], rtol=0, atol=1 / 300)
+    near(some.probability, every.probability[[4, 11]], 1 / 300)
     assert len(closure_probability(doubtful, contacts[:0])) == 0
-
-
-def test_bad_arguments_name_what_was_found(doubtful, generator):
-    contacts = contacts_on(doubtful, generator, 2)
-    far = Contacts(contacts.points * 100, contacts.normals)
-    two = Contacts(contacts.points[:, :2], contacts.normals[:, :2])
-    long = Contacts(contacts.points, 1.1 * contacts.normals)
-    for action, match in (
-        (lambda: closure_probability(doubtful, contacts, n=0), "n: expected .*got 0"),
-        (lambda: closure_probability(doubtful, contacts, seed=-1), "seed: expected .*got -1"),
-        (lambda: closure_probability(doubtful, far), "domain"),
-        (lambda: closure_probability(doubtful, long), "unit vectors"),
-        (lambda: closure_probability(doubtful, two), "expected 3 to 5.*got 2 contacts a row"),
-    ):
-        with pytest.raises(BadArgument, match=match):
-            action()

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from tests.make import CUP_RADIUS as RADIUS
-from tests.make import cup_view
+from tests.make import cup_view, real
 from tests.make import cylinder_points as ring
+from torchgrasp import fit_shape
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import tangents
 from torchgrasp.plan.feasibility import GUIDING_POINTS, INSIDE, flatness_constraint, normal_variation
 from torchgrasp.plan.problem import triple_jet
 from torchgrasp.plan.solver import project
-from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.hollow import HollowShape
 
 RING_RADIUS = 0.008
@@ -25,12 +25,17 @@ def on_surface(ellipsoid, generator, count: int, fingertips: int) -> Tensor:
     return project(ellipsoid, torch.randn(count, fingertips, 3, generator=generator, dtype=torch.float64), steps=8)
 
 
-def test_variation_on_a_sphere_is_the_angle_under_which_the_ring_is_seen_from_its_centre(ellipsoid, generator):
+def test_variation_on_a_sphere_is_the_angle_of_the_ring_and_values_change_sign_there(ellipsoid, generator):
     sphere = dataclasses.replace(ellipsoid, axes=(0.5, 0.5, 0.5))
     points = 0.5 * unit(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64))
     found = normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS)
     expected = math.atan(RING_RADIUS / (0.5 * sphere.scale))
     torch.testing.assert_close(found, torch.full_like(found, expected))
+    angle = float(normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS).mean())
+    for limit, sign in ((0.99 * angle / INSIDE, 1), (1.01 * angle / INSIDE, -1)):
+        value = flatness_constraint(sphere, points, limit, RING_RADIUS).value
+        assert value.shape == (5, 3 * GUIDING_POINTS)
+        assert bool((sign * value > 0).all())
 
 
 def test_variation_is_infinite_but_among_the_contacts_asked_for(ellipsoid, generator):
@@ -41,16 +46,6 @@ def test_variation_is_infinite_but_among_the_contacts_asked_for(ellipsoid, gener
     assert bool(torch.isinf(found[~among]).all() and torch.isfinite(every).all())
 
 
-def test_values_on_a_sphere_change_sign_at_the_angle_under_which_the_ring_is_seen(ellipsoid, generator):
-    sphere = dataclasses.replace(ellipsoid, axes=(0.5, 0.5, 0.5))
-    points = 0.5 * unit(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64))
-    angle = float(normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS).mean())
-    for limit, sign in ((0.99 * angle / INSIDE, 1), (1.01 * angle / INSIDE, -1)):
-        value = flatness_constraint(sphere, points, limit, RING_RADIUS).value
-        assert value.shape == (5, 3 * GUIDING_POINTS)
-        assert bool((sign * value > 0).all())
-
-
 @pytest.mark.parametrize("fingertips", [3, 5])
 def test_slope_against_automatic_differentiation(ellipsoid, generator, fingertips):
     """The ring's tangents are carried along without spin, as t - n (n . t) does to first order."""
@@ -59,12 +54,12 @@ def test_slope_against_automatic_differentiation(ellipsoid, generator, fingertip
     normals = triple_jet(ellipsoid, points).normals
     first = tangents(points, normals)
     second = torch.linalg.cross(normals, first)
-    inverse = 1 / torch.tensor(ellipsoid.axes, dtype=torch.float64) ** 2
+    inverse = 1 / real(ellipsoid.axes) ** 2
 
     def values(x: Tensor) -> Tensor:
         normal, rows = unit(x * inverse), []
         for k in range(GUIDING_POINTS):
-            angle = torch.tensor(2 * torch.pi * k / GUIDING_POINTS, dtype=torch.float64)
+            angle = real(2 * torch.pi * k / GUIDING_POINTS)
             t = angle.cos() * first + angle.sin() * second
             t = t - normal * (normal * t).sum(-1, keepdim=True)
             other = unit((x + RING_RADIUS / ellipsoid.scale * t) * inverse)

@@ -1,5 +1,6 @@
 """Internal forces: balance, friction, scale, against SciPy's solution of the same problem."""
 
+import functools
 import math
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 import torch
 from scipy.optimize import linprog
 
+from tests.make import near, real, spokes
 from torchgrasp.geometry.frames import rotation_from_vector
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.forces import (
     _search_steps,
     central_forces,
@@ -17,14 +20,14 @@ from torchgrasp.plan.forces import (
     tangential_ratio,
 )
 
+TURN = rotation_from_vector(real([0.4, -0.9, 0.3]))
 FINGERTIPS = pytest.mark.parametrize("fingertips", [3, 4, 5])
 
 
 def pinch(spread=0.02, half=0.03):
     """Index and middle against the thumb on a cylinder of radius `half` about z."""
-    points = torch.tensor([[half, 0, spread], [half, 0, -spread], [-half, 0, 0.0]], dtype=torch.float64)
-    normals = torch.tensor([[1, 0, 0], [1, 0, 0], [-1, 0, 0]], dtype=torch.float64)
-    return points, normals
+    points = real([[half, 0, spread], [half, 0, -spread], [-half, 0, 0.0]])
+    return points, real([[1, 0, 0], [1, 0, 0], [-1, 0, 0]])
 
 
 def tripods(count, seed, fingertips=3):
@@ -32,11 +35,15 @@ def tripods(count, seed, fingertips=3):
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(2, count, fingertips, 3, generator=generator, dtype=torch.float64)
     angles = torch.arange(fingertips, dtype=torch.float64) * 2 * math.pi / fingertips
-    ring = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)
-    points = ring + 0.25 * noise[0]
-    points = 0.04 * points / points.norm(dim=-1, keepdim=True)
-    outward = points / 0.04 + 0.25 * noise[1]
-    return points, outward / outward.norm(dim=-1, keepdim=True)
+    points = 0.04 * unit(spokes(*angles.tolist()) + 0.25 * noise[0])
+    return points, unit(points / 0.04 + 0.25 * noise[1])
+
+
+@functools.cache
+def judged(fingertips):
+    """Eight tripods, and the least friction that balances each."""
+    points, normals = tripods(8, 2, fingertips)
+    return points, normals, [least_ratio(p.numpy(), n.numpy()) for p, n in zip(points, normals, strict=True)]
 
 
 def least_ratio(points, normals):
@@ -52,10 +59,10 @@ def least_ratio(points, normals):
         matrix = np.stack(columns, 1)
         f = len(points)
         ones = np.kron(np.eye(f), np.ones(64))  # normal force of each contact
-        unit = np.concatenate([matrix / 0.04, np.ones((1, 64 * f))])
+        scaled = np.concatenate([matrix / 0.04, np.ones((1, 64 * f))])
         least = -ones  # each contact presses with at least 2 % of the sum
         answer = linprog(
-            np.zeros(64 * f), A_ub=least, b_ub=-0.02 * np.ones(f), A_eq=unit, b_eq=np.eye(7)[6], method="highs"
+            np.zeros(64 * f), A_ub=least, b_ub=-0.02 * np.ones(f), A_eq=scaled, b_eq=np.eye(7)[6], method="highs"
         )
         return answer.status == 0
 
@@ -79,7 +86,7 @@ def test_internal_forces_span_the_null_space_of_the_grasp_map(fingertips):
 
 
 @FINGERTIPS
-def test_least_friction_forces_balance_and_are_scaled(fingertips):
+def test_least_friction_forces_balance_are_scaled_and_come_nearer_to_the_preferred_ones(fingertips):
     points, normals = tripods(64, 1, fingertips)
     forces = least_friction_forces(points, normals, 5.0)
     good = torch.isfinite(forces).all(-1).all(-1)
@@ -88,56 +95,46 @@ def test_least_friction_forces_balance_and_are_scaled(fingertips):
     assert forces.sum(-2).abs().max() < 1e-9
     assert torch.linalg.cross(points, forces).sum(-2).abs().max() < 1e-9
     push = -(forces * normals).sum(-1)
-    assert torch.allclose(push.amax(-1), torch.tensor(5.0, dtype=torch.float64))
+    assert torch.allclose(push.amax(-1), real(5.0))
     assert (push > 0.05).all()
+    points, normals = tripods(60, 3, fingertips)
+    wanted = torch.linspace(1.0, 0.4, fingertips, dtype=torch.float64)
+
+    def off(preferred):
+        forces = least_friction_forces(points, normals, 1.0, preferred)
+        return (-(forces * normals).sum(-1) - wanted).abs().nanmean()
+
+    assert off(wanted[None]) < 0.97 * off(None)
+    nothing = torch.zeros(2, 0, fingertips, 3)
+    assert least_friction_forces(nothing, nothing).shape == nothing.shape
+    assert least_friction_forces(nothing[0], nothing[0], 4.0, nothing[0, ..., 0]).shape == nothing.shape[1:]
 
 
 @FINGERTIPS
-def test_least_friction_forces_agree_with_linear_programmes(fingertips):
-    points, normals = tripods(12, 2, fingertips)
-    forces = least_friction_forces(points, normals, 1.0)
-    ratios = tangential_ratio(forces, normals).amax(-1)
-    for k in range(len(points)):
-        oracle = least_ratio(points[k].numpy(), normals[k].numpy())
-        if not torch.isfinite(ratios[k]):
+def test_least_friction_and_central_forces_agree_with_linear_programmes(fingertips):
+    points, normals, oracles = judged(fingertips)
+    central = central_forces(points, normals, points.new_ones(8, fingertips), 1e-3)
+    found = (tangential_ratio(x, normals).amax(-1) for x in (least_friction_forces(points, normals, 1.0), central))
+    compared = 0
+    for oracle, searched, centred in zip(oracles, *found, strict=True):
+        if not torch.isfinite(searched):
             assert oracle > 2.0
         elif oracle < 2.0:
-            assert oracle - 0.02 <= ratios[k] <= oracle + (0.05 if fingertips == 3 else 0.1)
+            assert oracle - 0.02 <= searched <= oracle + (0.05 if fingertips == 3 else 0.1)
+        if oracle < 2.0:
+            assert centred == pytest.approx(oracle, abs=0.02)
+            compared += 1
+    assert compared >= 5
 
 
-def test_least_friction_forces_of_a_pinch_are_even():
+def test_least_friction_forces_of_a_pinch_are_even_turn_with_the_frame_and_need_a_balance():
     points, normals = pinch()
     forces = least_friction_forces(points, normals, 6.0)
-    push = -(forces * normals).sum(-1)
-    assert torch.allclose(push, torch.tensor([3.0, 3.0, 6.0], dtype=torch.float64), atol=0.05)
+    near(-(forces * normals).sum(-1), real([3.0, 3.0, 6.0]), 0.05)
     assert tangential_ratio(forces, normals).max() < 1e-2
-
-
-def test_least_friction_forces_turn_with_the_frame():
-    points, normals = pinch()
-    rotation = rotation_from_vector(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
-    here = least_friction_forces(points, normals, 4.0) @ rotation.T
-    there = least_friction_forces(points @ rotation.T, normals @ rotation.T, 4.0)
-    assert (here - there).abs().max() < 0.1
-
-
-def test_least_friction_forces_are_nan_without_a_balance():
-    points, normals = pinch()
+    there = least_friction_forces(points @ TURN.T, normals @ TURN.T, 6.0)
+    assert (forces @ TURN.T - there).abs().max() < 0.15
     assert torch.isnan(least_friction_forces(points, normals[:1].expand(3, 3).contiguous(), 4.0)).all()
-
-
-@FINGERTIPS
-def test_central_forces_need_the_least_friction(fingertips):
-    points, normals = tripods(12, 4, fingertips)
-    forces = central_forces(points, normals, points.new_ones(12, fingertips), 1e-3)
-    ratios = tangential_ratio(forces, normals).amax(-1)
-    compared = 0
-    for k in range(12):
-        oracle = least_ratio(points[k].numpy(), normals[k].numpy())
-        if oracle < 2.0:
-            assert ratios[k] == pytest.approx(oracle, abs=0.02)
-            compared += 1
-    assert compared >= 8
 
 
 def test_search_and_central_forces_agree():
@@ -161,30 +158,12 @@ def test_least_friction_forces_do_not_depend_on_the_batch(uneven):
         torch.testing.assert_close(alone, together[k], rtol=0, atol=1e-9, equal_nan=True)
 
 
-@FINGERTIPS
-def test_least_friction_forces_of_an_empty_batch(fingertips):
-    nothing = torch.zeros(2, 0, fingertips, 3)
-    assert least_friction_forces(nothing, nothing).shape == nothing.shape
-    assert least_friction_forces(nothing[0], nothing[0], 4.0, nothing[0, ..., 0]).shape == nothing.shape[1:]
-
-
-def test_least_friction_forces_ignore_the_default_device():
-    points, normals = tripods(1, 8)
-    here = least_friction_forces(points, normals)
-    _search_steps.cache_clear()
-    with torch.device("meta"):
-        there = least_friction_forces(points, normals)
-    torch.testing.assert_close(there, here, rtol=0, atol=0)
-
-
 def test_least_friction_forces_of_five_fingers_follow_the_preferred_ones():
-    corners = [[0.03, y, z] for y, z in ((-0.02, -0.02), (-0.02, 0.02), (0.02, -0.02), (0.02, 0.02))]
-    points = torch.tensor([*corners, [-0.03, 0.0, 0.0]], dtype=torch.float64)
-    normals = torch.tensor([[1.0, 0, 0]] * 4 + [[-1.0, 0, 0]], dtype=torch.float64)
-    forces = least_friction_forces(points, normals, 8.0)
-    push = -(forces * normals).sum(-1)
-    torch.testing.assert_close(push, torch.tensor([2.0, 2, 2, 2, 8], dtype=torch.float64), rtol=0, atol=0.01)
-    uneven = torch.tensor([0.1, 0.4, 0.4, 0.1, 1.0], dtype=torch.float64)
+    points = real([*([0.03, y, z] for y in (-0.02, 0.02) for z in (-0.02, 0.02)), [-0.03, 0.0, 0.0]])
+    normals = real([[1.0, 0, 0]] * 4 + [[-1.0, 0, 0]])
+    push = -(least_friction_forces(points, normals, 8.0) * normals).sum(-1)
+    near(push, real([2.0, 2, 2, 2, 8]), 0.01)
+    uneven = real([0.1, 0.4, 0.4, 0.1, 1.0])
     push = -(least_friction_forces(points, normals, 8.0, uneven) * normals).sum(-1)
     assert float(push[1]) == pytest.approx(float(push[2]), abs=0.05)
     assert float(push[1]) > 2 * float(push[0])
@@ -193,16 +172,15 @@ def test_least_friction_forces_of_five_fingers_follow_the_preferred_ones():
 @pytest.mark.parametrize("fingertips", [4, 5])
 def test_forces_of_more_contacts_turn_with_the_frame(fingertips):
     points, normals = tripods(20, 6, fingertips)
-    rotation = rotation_from_vector(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
     here = least_friction_forces(points, normals, 4.0)
     good = torch.isfinite(here).flatten(1).all(1)
     assert int(good.sum()) > 15
-    there = least_friction_forces(points @ rotation.T, normals @ rotation.T, 4.0)
-    torch.testing.assert_close((here @ rotation.T)[good], there[good], rtol=0, atol=1e-6)
-    torch.testing.assert_close(least_friction_forces(points[7], normals[7], 4.0), here[7], rtol=0, atol=1e-9)
+    there = least_friction_forces(points @ TURN.T, normals @ TURN.T, 4.0)
+    near((here @ TURN.T)[good], there[good], 1e-6)
+    near(least_friction_forces(points[7], normals[7], 4.0), here[7], 1e-9)
 
 
-def test_forces_of_more_contacts_are_nan_without_a_balance():
+def test_forces_of_more_contacts_are_nan_without_a_balance_and_ignore_the_default_device():
     points, normals = tripods(3, 7, 4)
     alone = least_friction_forces(points, normals)
     assert bool(torch.isfinite(alone).all())
@@ -211,15 +189,9 @@ def test_forces_of_more_contacts_are_nan_without_a_balance():
     forces = least_friction_forces(points, normals)
     assert bool(torch.isnan(forces[[0, 2]]).all())
     torch.testing.assert_close(forces[1], alone[1])
-
-
-@FINGERTIPS
-def test_least_friction_forces_come_nearer_to_the_preferred_ones(fingertips):
-    points, normals = tripods(60, 3, fingertips)
-    wanted = torch.linspace(1.0, 0.4, fingertips, dtype=torch.float64)
-
-    def off(preferred):
-        forces = least_friction_forces(points, normals, 1.0, preferred)
-        return (-(forces * normals).sum(-1) - wanted).abs().nanmean()
-
-    assert off(wanted[None]) < 0.97 * off(None)
+    points, normals = tripods(1, 8)
+    here = least_friction_forces(points, normals)
+    _search_steps.cache_clear()
+    with torch.device("meta"):
+        there = least_friction_forces(points, normals)
+    near(there, here, 0)

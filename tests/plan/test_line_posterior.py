@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from tests.make import HALF_BALL_RADIUS as RADIUS
-from tests.make import contacts_on
+from tests.make import contacts_on, near
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure_probability import FOOTPRINT, NODES, first_contact, grid, line_posterior
 from torchgrasp.shape.posterior import combined_covariance, distance_covariance
@@ -35,7 +35,7 @@ def test_a_finger_stops_where_the_drawn_distance_turns_negative_nearest_to_its_c
         assert abs(stop) <= np.abs(stops).min() + 3.0  # nearest, but for the width of a step
         met += 1
         there = np.array([np.interp(stop, nodes, slope[:, k]) for k in range(3)])
-        torch.testing.assert_close(normals[b, n, i], unit(torch.from_numpy(there)), rtol=0, atol=3e-2)
+        near(normals[b, n, i], unit(torch.from_numpy(there)), 3e-2)
     assert 2000 < met < 3000  # some meet nothing, at twice the real deviations
 
 
@@ -48,8 +48,8 @@ def test_the_posterior_on_the_lines_is_that_of_distance_and_normal(doubtful, gen
         step = int((grid() == NODES[k]).nonzero())
         at = lines.points[b, i] + lines.deviation[b, i] * grid()[step] * lines.normals[b, i]
         mean, covariance = doubtful.estimate(at[None])
-        torch.testing.assert_close(lines.distance[b, i, step], mean[0, 0], rtol=0, atol=1e-10)
-        torch.testing.assert_close(lines.slope[b, i, k], mean[0, 1:], rtol=0, atol=1e-10)
+        near(lines.distance[b, i, step], mean[0, 0], 1e-10)
+        near(lines.slope[b, i, k], mean[0, 1:], 1e-10)
         if float(torch.linalg.vector_norm(at)) <= edge:
             variance = doubtful.std_factor**2 * covariance[0, 0, 0]
             torch.testing.assert_close(deviation[b, i, k, 0, i, k, 0], variance, rtol=1e-6, atol=1e-12)
@@ -57,17 +57,14 @@ def test_the_posterior_on_the_lines_is_that_of_distance_and_normal(doubtful, gen
     assert 20 < held < 45  # outside the domain deviations are those at its edge
 
 
-def test_the_covariance_of_sums_is_that_of_the_distances_between_their_weights(doubtful, generator):
+def test_covariances_of_distances_and_their_sums_are_those_of_the_joint_posterior(doubtful, generator):
     x = unit(torch.randn(3, 2, 4, 3, generator=generator, dtype=torch.float64))
     weights = torch.randn(3, 2, 2, 4, generator=generator, dtype=torch.float64)
     whole = torch.stack([torch.block_diag(*blocks) for blocks in weights])
     expected = whole @ distance_covariance(doubtful, x.flatten(1, 2)) @ whole.mT
-    torch.testing.assert_close(combined_covariance(doubtful, x, weights), expected, rtol=0, atol=1e-9)
-
-
-def test_covariances_of_distances_are_those_of_the_joint_posterior(doubtful, generator):
+    near(combined_covariance(doubtful, x, weights), expected, 1e-9)
     x = unit(torch.randn(4, 5, 3, generator=generator, dtype=torch.float64))
     found = distance_covariance(doubtful, x)
     for i in range(4):
         joint = doubtful.joint(doubtful.metres(x[i])).covariance
-        torch.testing.assert_close(found[i], joint[::4, ::4], rtol=0, atol=1e-10)
+        near(found[i], joint[::4, ::4], 1e-10)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchgrasp import ContactSpec
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import closed_exact
 from torchgrasp.plan.problem import (
@@ -21,7 +22,6 @@ from torchgrasp.plan.problem import (
     split_unknowns,
     triple_jet,
 )
-from torchgrasp.specs import ContactSpec
 
 CPU = torch.device("cpu")
 SPEC = ContactSpec(table=0.47, tip_radius=0.03, separation=0.03)
@@ -41,35 +41,27 @@ def problem_and_state(ellipsoid, generator: torch.Generator, spec: ContactSpec =
     return problem, points, tension, triple_jet(ellipsoid, points)
 
 
-def test_eq10_surface_rows_are_the_distance_at_the_points(ellipsoid, generator):
+def test_eq10_to_eq12_and_eq14_rows_are_distance_gradient_variance_and_mean(ellipsoid, generator):
     problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    torch.testing.assert_close(problem.constraints(points, tension, jet).surface, ellipsoid.value(points))
-
-
-def test_eq11_normals_are_the_unit_outward_gradient(ellipsoid, generator):
-    *_, points, _, jet = problem_and_state(ellipsoid, generator)
+    rows = problem.constraints(points, tension, jet)
+    torch.testing.assert_close(rows.surface, ellipsoid.value(points))
     x = points.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(ellipsoid.value(x).sum(), x)
     torch.testing.assert_close(jet.normals, unit(gradient))
-
-
-def test_eq12_variance_row_is_positive_exactly_where_the_variance_exceeds_the_threshold(ellipsoid, generator):
-    problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    rows = problem.constraints(points, tension, jet)
     assert torch.equal(rows.bounds[:, 3:6] > 0, ellipsoid.doubt_at(points) > INSIDE * SPEC.max_variance)
+    torch.testing.assert_close(rows.centre, points.mean(1))
 
 
 @FINGERTIPS
-def test_eq13_forces_balance_whatever_the_tensions(ellipsoid, generator, fingertips):
+def test_eq13_forces_balance_and_cone_rows_are_their_cosines_and_imply_closure(ellipsoid, generator, fingertips):
     _, points, tension, _ = problem_and_state(ellipsoid, generator, with_fingertips(fingertips))
     force, _ = forces_from_tensions(points, tension)
     zero = torch.zeros(6, 3, dtype=torch.float64)
     torch.testing.assert_close(force.sum(1), zero)
     torch.testing.assert_close(torch.linalg.cross(points, force).sum(1), zero)
-
-
-@FINGERTIPS
-def test_eq13_cone_rows_are_the_cosines_of_the_forces_and_imply_closure(ellipsoid, generator, fingertips):
+    pairs = tension.shape[1]
+    alone = forces_from_tensions(points[:1].expand(pairs, -1, -1), torch.eye(pairs, dtype=torch.float64))[0].flatten(1)
+    assert int(torch.linalg.matrix_rank(alone)) == 3 * fingertips - 6  # as many as forces that balance have dimensions
     spec = with_fingertips(fingertips, ContactSpec.paper())
     problem, points, tension, jet = problem_and_state(ellipsoid, generator, spec, count=4000)
     rows = problem.constraints(points, tension, jet).bounds[:, :fingertips]
@@ -80,11 +72,6 @@ def test_eq13_cone_rows_are_the_cosines_of_the_forces_and_imply_closure(ellipsoi
     held = (rows <= 0).all(-1)
     assert int(held.sum()) > 10
     assert bool(closed_exact(points[held], jet.normals[held], problem.friction).all())
-
-
-def test_eq14_centre_rows_are_the_mean_of_the_contacts(ellipsoid, generator):
-    problem, points, tension, jet = problem_and_state(ellipsoid, generator)
-    torch.testing.assert_close(problem.constraints(points, tension, jet).centre, points.mean(1))
 
 
 @FINGERTIPS

@@ -6,16 +6,16 @@ import itertools
 import pytest
 import torch
 
+from tests.make import near, real, spokes
+from torchgrasp import ContactSpec, certify
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.certify import certify
 from torchgrasp.plan.closure import wrenches
 from torchgrasp.plan.feasibility import check_feasibility, first_violation, normal_variation
 from torchgrasp.plan.solve import TO_CENTRE, plan_chunk, plan_contacts
 from torchgrasp.plan.solver import project
 from torchgrasp.plan.starts import STARTS_PER_CHUNK, chunk_sizes, draw_in, drawn_starts, settle_flatness
-from torchgrasp.specs import ContactSpec
 
 SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, flatness=0.6, flat_radius=0.008)}
 
@@ -30,7 +30,7 @@ def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name, fingertips)
     good = plan[plan.status == Status.OK]
     x = ellipsoid.normalise(good.contacts.points)
     assert float(ellipsoid.value(x).abs().max()) <= 1e-6  # Eq. (10)
-    gradient = x / torch.tensor(ellipsoid.axes, dtype=torch.float64) ** 2
+    gradient = x / real(ellipsoid.axes) ** 2
     torch.testing.assert_close(good.contacts.normals, unit(gradient))  # Eq. (11)
     torch.testing.assert_close(good.contacts.variance, ellipsoid.doubt_at(x))
     torch.testing.assert_close(good.contacts.std_m, 0.65 * 0.06 * ellipsoid.doubt_at(x).sqrt() / gradient.norm(dim=-1))
@@ -52,15 +52,12 @@ def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name, fingertips)
         assert float(normal_variation(ellipsoid, x, good.contacts.normals, spec.ring_radius).max()) <= spec.flatness
 
 
-def test_eq14_centre_of_the_contacts_approaches_the_centre_of_the_shape(ellipsoid):
+def test_eq14_contacts_approach_the_centre_of_the_shape(ellipsoid):
     plan = plan_contacts(ellipsoid, ContactSpec.paper(), starts=60, seed=1)
     good = plan[plan.status == Status.OK]
-    centre = good.contacts.points.mean(1) - torch.tensor(ellipsoid.center, dtype=torch.float64)
+    centre = good.contacts.points.mean(1) - real(ellipsoid.center)
     torch.testing.assert_close(good.quality, torch.linalg.vector_norm(centre, dim=-1))
     assert float(good.quality.median()) < 0.002  # [m], of half axes of 30 to 60 mm
-
-
-def test_eq14_drawn_rows_are_pulled_towards_the_centre(ellipsoid):
     settled = settle_flatness(ellipsoid, ContactSpec(), 0)
     first = next(drawn_starts(ellipsoid, settled, [60], 0))
     plan = plan_chunk(ellipsoid, settled.spec, first, TO_CENTRE)
@@ -69,30 +66,26 @@ def test_eq14_drawn_rows_are_pulled_towards_the_centre(ellipsoid):
     assert int(good.sum()) > 5 and float(plan.quality[good].mean()) < 0.9 * float(begun.quality[good].mean())
 
 
-def test_same_seed_gives_the_same_bits_and_another_seed_another_plan(ellipsoid):
+def test_same_seed_gives_the_same_bits_another_seed_another_plan_and_no_feasible_start_is_lost(ellipsoid):
     spec = SPECS["table"]
     one, two, other = (plan_contacts(ellipsoid, spec, starts=20, seed=s) for s in (5, 5, 6))
     assert torch.equal(one.contacts.points, two.contacts.points)
     assert torch.equal(one.status, two.status)
     assert not torch.equal(one.contacts.points, other.contacts.points)
+    plan = plan_contacts(ellipsoid, spec, starts=40, seed=2)
+    feasible = plan.contacts.points[plan.status == Status.OK]
+    assert bool((plan_contacts(ellipsoid, spec, feasible).status == Status.OK).all())
+    assert len(plan_contacts(ellipsoid, spec, feasible[:0])) == 0
 
 
 def test_given_starts_keep_their_order_and_their_frame(ellipsoid, generator):
     starts = ellipsoid.metres(0.1 * unit(torch.randn(12, 3, 3, generator=generator, dtype=torch.float64)))
     forward = plan_contacts(ellipsoid, ContactSpec.paper(), starts)
     backward = plan_contacts(ellipsoid, ContactSpec.paper(), starts.flip(0))
-    torch.testing.assert_close(forward.contacts.points, backward.contacts.points.flip(0), atol=1e-6, rtol=0)
+    near(forward.contacts.points, backward.contacts.points.flip(0), 1e-6)
     elsewhere = dataclasses.replace(ellipsoid, center=(1.3, -0.2, 0.5))
-    moved = plan_contacts(elsewhere, ContactSpec.paper(), starts + torch.tensor([1.0, 0, 0], dtype=torch.float64))
-    torch.testing.assert_close(moved.quality, forward.quality, atol=1e-6, rtol=0)
-
-
-def test_a_feasible_start_is_never_lost(ellipsoid):
-    spec = SPECS["table"]
-    plan = plan_contacts(ellipsoid, spec, starts=40, seed=2)
-    feasible = plan.contacts.points[plan.status == Status.OK]
-    again = plan_contacts(ellipsoid, spec, feasible)
-    assert bool((again.status == Status.OK).all())
+    moved = plan_contacts(elsewhere, ContactSpec.paper(), starts + real([1.0, 0, 0]))
+    near(moved.quality, forward.quality, 1e-6)
 
 
 @pytest.mark.parametrize("spec", [ContactSpec.paper(), ContactSpec()])
@@ -129,18 +122,15 @@ def test_more_starts_only_add_rows(ellipsoid, monkeypatch):
         torch.testing.assert_close(few.contacts.points, many.contacts.points[:10])
 
 
-def test_chunks_hold_all_starts_and_no_more():
-    for count in (0, 1, 499, 500, 501, 1700):
-        sizes = chunk_sizes(count)
-        assert sum(sizes) == count and all(0 < size <= STARTS_PER_CHUNK for size in sizes)
-
-
-def test_far_starts_are_drawn_in_and_those_on_the_surface_stay(ellipsoid, generator):
+def test_far_starts_are_drawn_in_others_stay_and_chunks_hold_all(ellipsoid, generator):
     on = project(ellipsoid, 0.9 * unit(torch.randn(3, 3, 3, generator=generator, dtype=torch.float64)), 8)
     torch.testing.assert_close(draw_in(ellipsoid, on), on)
     drawn = draw_in(ellipsoid, 2 * on)
     torch.testing.assert_close(drawn.mean(1), torch.zeros(3, 3, dtype=torch.float64))
     assert float(torch.linalg.vector_norm(drawn, dim=-1).max()) <= 0.1 + 1e-12
+    for count in (0, 1, 499, 500, 501, 1700):
+        sizes = chunk_sizes(count)
+        assert sum(sizes) == count and all(0 < size <= STARTS_PER_CHUNK for size in sizes)
 
 
 @pytest.mark.parametrize(
@@ -169,23 +159,16 @@ def test_contacts_on_opposite_sides_of_a_thin_thing_may_be_as_near_as_it_is_thin
     assert float(sides[beside].min()) > 0.024  # tips on the same side, whose normals hardly differ
 
 
-def test_no_starts_give_no_rows(ellipsoid):
-    assert len(plan_contacts(ellipsoid, ContactSpec(), torch.zeros(0, 3, 3))) == 0
-
-
 def test_an_impossible_problem_names_the_constraint(ellipsoid):
     doubtful = dataclasses.replace(ellipsoid, doubt=10.0)
     plan = plan_contacts(doubtful, ContactSpec.paper(), starts=10)
     assert set(plan.status.tolist()) == {int(Status.TOO_UNCERTAIN)}
-    high = plan_contacts(ellipsoid, ContactSpec(table=0.6), starts=10)
-    assert not bool((high.status == Status.OK).any())
-    slippery = plan_contacts(ellipsoid, ContactSpec.paper(friction=0.0), starts=10)
-    assert not bool((slippery.status == Status.OK).any())
+    for spec in (ContactSpec(table=0.6), ContactSpec.paper(friction=0.0)):
+        assert not bool((plan_contacts(ellipsoid, spec, starts=10).status == Status.OK).any())
 
 
-def test_statuses_name_the_first_violation(ellipsoid):
-    angle = torch.tensor([0.0, 2.1, 4.2], dtype=torch.float64)
-    around = torch.stack([angle.cos(), 0.6 * angle.sin(), torch.zeros(3, dtype=torch.float64)], -1)
+def test_statuses_name_the_first_violation_in_order(ellipsoid):
+    around = spokes(0.0, 2.1, 4.2)[0] * real([1.0, 0.6, 1.0])
     spec = ContactSpec(friction_margin=1.0, flatness=None)
     seen = dataclasses.replace(ellipsoid, doubt=1e-4)
 
@@ -203,11 +186,8 @@ def test_statuses_name_the_first_violation(ellipsoid):
     assert status(touching) is Status.TOO_CLOSE
     assert status(touching, dataclasses.replace(spec, separation=0.0)) is Status.DEGENERATE
     assert status(around, dataclasses.replace(spec, flatness=0.1)) is Status.NOT_FLAT
-    close = project(seen, torch.tensor([[[1.0, 0, 0], [0.8, 0.4, 0], [0.8, -0.4, 0]]], dtype=torch.float64), 8)[0]
+    close = project(seen, real([[[1.0, 0, 0], [0.8, 0.4, 0], [0.8, -0.4, 0]]]), 8)[0]
     assert status(close, dataclasses.replace(spec, friction=0.3, separation=0.01)) is Status.NOT_CLOSED
-
-
-def test_first_violation_is_the_first_in_order():
     good = {
         Status.OFF_SURFACE: torch.tensor([True, False, True, False]),
         Status.NOT_CLOSED: torch.tensor([True, True, False, False]),
@@ -215,36 +195,22 @@ def test_first_violation_is_the_first_in_order():
     assert first_violation(good).tolist() == [Status.OK, Status.OFF_SURFACE, Status.NOT_CLOSED, Status.OFF_SURFACE]
 
 
-@pytest.mark.parametrize("starts", [0, -3, True])
-def test_bad_numbers_of_starts_are_refused(ellipsoid, starts):
-    with pytest.raises(BadArgument, match="starts"):
-        plan_contacts(ellipsoid, starts=starts)
-
-
-def test_what_is_no_shape_specification_or_seed_is_refused(ellipsoid):
-    for seconds in (0.0, float("nan")):
-        with pytest.raises(BadArgument, match="time_budget"):
-            plan_contacts(ellipsoid, starts=3, time_budget=seconds)
-    with pytest.raises(BadArgument, match=r"seed: expected .*got -1"):
-        plan_contacts(ellipsoid, starts=3, seed=-1)
+def test_bad_arguments_are_refused(ellipsoid):
     wrong = (BadArgument, TypeError)  # TypeError: the annotations are checked in tests
-    with pytest.raises(wrong, match="shape"):
-        plan_contacts(None)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(wrong, match="spec"):
-        plan_contacts(ellipsoid, 0.8)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(wrong, match="seed"):
-        plan_contacts(ellipsoid, starts=3, seed=1.5)  # pyright: ignore[reportArgumentType]
-
-
-def test_bad_starting_points_are_refused(ellipsoid):
+    for name, bad in (
+        ("shape", None), ("spec", 0.8), ("starts", 0), ("starts", -3), ("starts", True), ("time_budget", 0.0),
+        ("time_budget", float("nan")), ("seed", -1), ("seed", 1.5),
+    ):  # fmt: skip
+        with pytest.raises(wrong, match=name):
+            plan_contacts(**{"shape": ellipsoid, "starts": 3, name: bad})
     far = torch.zeros(2, 3, 3, dtype=torch.float64)
     far[1, 2, 0] = 3.0
-    with pytest.raises(BadArgument, match=r"starts: .* from the shape's centre"):
-        plan_contacts(ellipsoid, starts=far)
-    with pytest.raises(BadArgument, match="finite"):
-        plan_contacts(ellipsoid, starts=far * torch.nan)
-    four = torch.zeros(2, 4, 3, dtype=torch.float64)
-    with pytest.raises(BadArgument, match=r"starts: expected .*got 4 contacts a row"):
-        plan_contacts(ellipsoid, starts=four)
+    for starts, match in (
+        (far, r"starts: .* from the shape's centre"),
+        (far * torch.nan, "finite"),
+        (torch.zeros(2, 4, 3, dtype=torch.float64), r"starts: expected .*got 4 contacts a row"),
+    ):
+        with pytest.raises(BadArgument, match=match):
+            plan_contacts(ellipsoid, starts=starts)
     with pytest.raises(BadArgument, match="start_radius"):
         plan_contacts(dataclasses.replace(ellipsoid, domain_radius=0.5))

@@ -9,11 +9,11 @@ import torch
 
 from tests.make import ring_samples as ring
 from tests.make import run_python
+from torchgrasp import GraspMixture, load_mixture
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import load_tensors
 from torchgrasp.posture_model.em import Progress, Shard
 from torchgrasp.posture_model.fit import Checkpoint, fit_mixture
-from torchgrasp.posture_model.mixture import GraspMixture, load_mixture
 from torchgrasp.posture_model.sample import HandSamples
 
 
@@ -78,7 +78,7 @@ fit_mixture(ring(), 5, iterations=12, tolerance=0.0, checkpoint={str(path)!r}, o
     assert torch.equal(parameters(again), parameters(fit_mixture(ring(), 5, iterations=12, tolerance=0.0)))
 
 
-def test_the_checkpoint_of_another_fit_is_refused(tmp_path):
+def test_the_checkpoint_of_another_fit_a_damaged_one_and_bad_folders_are_refused(tmp_path):
     samples, path = ring(), tmp_path / "fit.safetensors"
     fit_mixture(samples, 5, iterations=2, checkpoint=path)
     moved = dataclasses.replace(samples, joints=samples.joints * (1 + 1e-6))
@@ -92,10 +92,6 @@ def test_the_checkpoint_of_another_fit_is_refused(tmp_path):
     ]:
         with pytest.raises(BadArgument, match=r"checkpoint: expected .*got"):
             fit_mixture(other, **given, iterations=2, checkpoint=path)
-
-
-def test_a_damaged_checkpoint_and_a_folder_that_cannot_be_written_are_named(tmp_path):
-    samples, path = ring(), tmp_path / "fit.safetensors"
     mixture = fit_mixture(samples, 5, iterations=2, checkpoint=path)
     data = path.read_bytes()
     for damaged in (b"", data[: len(data) // 2], mixture.save(tmp_path / "mixture.safetensors").read_bytes()):
@@ -139,7 +135,7 @@ class OtherProcesses(Shard):
         return x + torch.tensor([1 + 3, 1 + 9])
 
 
-def test_processes_whose_checkpoints_differ_are_all_refused(tmp_path):
+def test_processes_whose_checkpoints_differ_are_all_refused_and_no_group_is_named(tmp_path):
     path = tmp_path / "fit.safetensors"
     mixture = fit_mixture(ring(), 5, iterations=2, checkpoint=path)
     shapes = {"weights", "means", "covariances", "reseeded", "log_likelihood", "centre", "scale"}
@@ -150,8 +146,5 @@ def test_processes_whose_checkpoints_differ_are_all_refused(tmp_path):
     assert progress is not None and len(progress.log_likelihood) == 2 == int(mixture.meta["iterations"])
     with pytest.raises(BadArgument, match="some processes see"):  # although 2 steps are the mean of 1, 2 and 3
         dataclasses.replace(alone, shard=OtherProcesses(ring().rows(), 1, 3)).load()
-
-
-def test_distributed_without_a_group_is_named():
     with pytest.raises(BadArgument, match=r"distributed: expected .*got True in a process without a group"):
         fit_mixture(ring(), 5, distributed=True)

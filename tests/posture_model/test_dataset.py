@@ -12,12 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchgrasp import load_hand
 from torchgrasp.app.cli import main
 from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import hold_folder
-from torchgrasp.hand.load import load_hand
-from torchgrasp.posture_model.dataset import load_samples, write_samples
-from torchgrasp.posture_model.sample import SampleSpec, sample_configurations
+from torchgrasp.posture_model import SampleSpec, load_samples, sample_configurations, write_samples
 
 
 @pytest.fixture
@@ -72,7 +71,7 @@ def test_a_folder_serves_a_loader_posture_by_posture(tmp_path, small):
 HELD_RUN = """
 import signal, sys, threading
 from torchgrasp.app.cli import main
-from torchgrasp.posture_model import dataset
+from torchgrasp.posture_model import dataset, sample
 
 interrupted = threading.Event()
 
@@ -86,14 +85,16 @@ def draw_the_first(hand, spec, i, draw=dataset.draw_chunk):
     return draw(hand, spec, i)
 
 signal.signal(signal.SIGINT, interrupt)
+sample.CHUNK_POSTURES = dataset.CHUNK_POSTURES = 500
+sample.BLOCK_POSTURES = 250
 dataset.draw_chunk = draw_the_first
 sys.exit(main({arguments!r}))
 """
 
 
 @pytest.mark.promise("F1")
-def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tmp_path):
-    hand, n, folder = load_hand("barrett"), 70_000, tmp_path / "killed"
+def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tmp_path, small):
+    hand, n, folder = load_hand("barrett"), 3500, tmp_path / "killed"
     arguments = ["hand", "sample", "--hand", "barrett", "--n", str(n), "--out", str(folder), "--workers", "2"]
     for sign, expected, held in ((signal.SIGINT, 130, 2), (signal.SIGKILL, -signal.SIGKILL, 5)):
         before = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
@@ -126,16 +127,6 @@ def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
         assert contents(tmp_path) == whole
 
 
-@pytest.mark.promise("F7")
-def test_a_second_run_on_the_folder_is_refused(tmp_path, small):
-    hand = load_hand("barrett")
-    with hold_folder(tmp_path), pytest.raises(OutputError, match=f"in use by process {os.getpid()} on"):
-        write_samples(hand, SampleSpec(100), tmp_path)
-    (tmp_path / ".lock").write_text("process 1 on nowhere")  # left by a run that was killed: nobody holds it
-    write_samples(hand, SampleSpec(100), tmp_path)
-    assert not (tmp_path / ".lock").exists()
-
-
 @pytest.mark.promise("F3")
 def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_path, small, monkeypatch):
     hand = load_hand("barrett")
@@ -166,7 +157,8 @@ def test_a_run_killed_between_a_temporary_file_and_its_name_is_continued(tmp_pat
     ]
 
 
-def test_a_folder_of_other_samples_or_files_is_refused(tmp_path, small):
+@pytest.mark.promise("F7")
+def test_a_folder_in_use_or_of_other_samples_or_files_is_refused(tmp_path, small):
     hand = load_hand("barrett")
     write_samples(hand, SampleSpec(600), tmp_path / "a")
     for other in (SampleSpec(601), SampleSpec(600, 1), SampleSpec(600, 0, "grasping")):
@@ -183,26 +175,30 @@ def test_a_folder_of_other_samples_or_files_is_refused(tmp_path, small):
         SampleSpec(600, 0, "thumbs")  # pyright: ignore[reportArgumentType]
     with pytest.raises(BadArgument, match=r"workers: expected .*got 0"):
         write_samples(hand, SampleSpec(600), tmp_path / "a", workers=0)
+    held = tmp_path / "c"
+    with hold_folder(held), pytest.raises(OutputError, match=f"in use by process {os.getpid()} on"):
+        write_samples(hand, SampleSpec(100), held)
+    held.mkdir(exist_ok=True)
+    (held / ".lock").write_text("process 1 on nowhere")  # left by a run that was killed: nobody holds it
+    write_samples(hand, SampleSpec(100), held)
+    assert not (held / ".lock").exists()
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"n": 0}, {"n": True}, {"n": 10**12}, {"n": "600"}, {"joint_names": []}, {"joint_names": "abcd"}, {"seed": 0},
-     {"chunk": 7}, {"version": 2}, {"torchgrasp": "grasps"}, {"joint_names": ["a"]}, {"hand": "allegro"}],
-)  # fmt: skip
-def test_a_damaged_manifest_is_refused(tmp_path, small, change):
+def test_a_damaged_manifest_and_what_is_none_are_refused(tmp_path, small):
     write_samples(load_hand("barrett"), SampleSpec(600), tmp_path)
     path = tmp_path / "samples.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(ModelFileError):
-        load_samples(tmp_path).read()
-
-
-@pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff\xfe", b"[" * 100_000, b" " * 2_000_000])
-def test_what_is_no_manifest_is_refused(tmp_path, data):
-    (tmp_path / "samples.json").write_bytes(data)
-    with pytest.raises(ModelFileError, match=r"samples\.json"):
-        load_samples(tmp_path)
+    good = json.loads(path.read_text())
+    for change in (
+        {"n": 0}, {"n": True}, {"n": 10**12}, {"n": "600"}, {"joint_names": []}, {"joint_names": "abcd"}, {"seed": 0},
+        {"chunk": 7}, {"version": 2}, {"torchgrasp": "grasps"}, {"joint_names": ["a"]}, {"hand": "allegro"},
+    ):  # fmt: skip
+        path.write_text(json.dumps(good | change))
+        with pytest.raises(ModelFileError):
+            load_samples(tmp_path).read()
+    for data in (b"", b"{", b"[]", b"\xff\xfe", b"[" * 100_000, b" " * 2_000_000):
+        path.write_bytes(data)
+        with pytest.raises(ModelFileError, match=r"samples\.json"):
+            load_samples(tmp_path)
     with pytest.raises(ModelFileError, match=r"samples\.json, which is no file"):
         load_samples(tmp_path / "nowhere")
 

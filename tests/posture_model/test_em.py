@@ -7,6 +7,7 @@ import pytest
 import torch
 from sklearn.mixture import GaussianMixture
 
+from tests.make import near, real
 from torchgrasp.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.posture_model.em import (
     MAX_RESEEDS,
@@ -32,24 +33,21 @@ def clustered(n: int = 6000, d: int = 5, m: int = 4) -> torch.Tensor:
     return torch.from_numpy((x - x.mean(0)) / x.std(0))
 
 
-def test_eq19_features_give_the_gaussian_density(generator):
+def test_eq19_features_give_the_gaussian_density_and_eq20_one_component_the_sample_moments(generator):
     d, m = 4, 3
     root = torch.randn(m, d, d, generator=generator, dtype=torch.float64)
     covariances = root @ root.transpose(1, 2) + 0.1 * torch.eye(d, dtype=torch.float64)
     means = torch.randn(m, d, generator=generator, dtype=torch.float64)
-    weights = torch.tensor([0.2, 0.3, 0.5], dtype=torch.float64)
+    weights = real([0.2, 0.3, 0.5])
     x = torch.randn(50, d, generator=generator, dtype=torch.float64)
     result = coefficients_from_components(Components(weights, means, covariances)) @ features_from_data(x)
     for k in range(m):
         gaussian = torch.distributions.MultivariateNormal(means[k], covariances[k])
         torch.testing.assert_close(result[k], gaussian.log_prob(x) + weights[k].log(), rtol=1e-9, atol=1e-9)
-
-
-def test_eq20_one_component_is_the_sample_mean_and_covariance():
     x = clustered()
     result = components_from_sums(features_from_data(x).sum(1)[None], len(x), 0.0)
     torch.testing.assert_close(result.weights, torch.ones(1, dtype=torch.float64))
-    torch.testing.assert_close(result.means[0], x.mean(0), atol=1e-12, rtol=0)
+    near(result.means[0], x.mean(0), 1e-12)
     torch.testing.assert_close(result.covariances[0], torch.cov(x.T, correction=0))
 
 
@@ -88,34 +86,31 @@ def test_log_likelihood_never_decreases(m):
     torch.testing.assert_close(log_likelihood / len(x), fit.log_likelihood[-1])
 
 
-def test_start_is_the_same_for_the_same_seed():
+def test_start_finds_separate_clusters_by_the_seed_and_names_fewer_rows_than_components(generator):
     x = clustered()
     first, second = (start_components(Shard(x), 5, 7, 1e-6) for _ in range(2))
     assert torch.equal(first.components.means, second.components.means)
     assert not torch.equal(first.components.means, start_components(Shard(x), 5, 8, 1e-6).components.means)
-
-
-def test_start_finds_separate_clusters(generator):
-    centres = torch.tensor([[-2.0, 0], [2, 0], [0, 3]], dtype=torch.float64)
+    centres = real([[-2.0, 0], [2, 0], [0, 3]])
     x = (centres[:, None] + 0.05 * torch.randn(3, 200, 2, generator=generator, dtype=torch.float64)).flatten(0, 1)
     start = start_components(Shard(x), 3, 0, 0.0).components
     torch.testing.assert_close(start.weights, torch.full((3,), 1 / 3, dtype=torch.float64))
     assert float(torch.cdist(centres, start.means).amin(1).max()) < 0.02
-
-
-def test_fewer_different_rows_than_components_are_named():
-    rows = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=torch.float64).repeat(50, 1)
+    rows = real([[0.0, 1.0], [1.0, 0.0]]).repeat(50, 1)
     with pytest.raises(BadArgument, match=r"components: expected at most 2, .*got 3"):
         start_components(Shard(rows), 3, 0, 1e-6)
 
 
-def test_an_indefinite_start_is_an_error_not_a_repair():
+def test_an_indefinite_start_and_data_that_span_no_covariance_are_errors():
     x = clustered()
     start = start_components(Shard(x), 3, 0, 1e-6)
     flat = start.components.covariances * torch.tensor([1.0, 1, 0])[:, None, None]
     components = Components(start.components.weights, start.components.means, flat)
     with pytest.raises(IndefiniteCovariance, match="fewer components"):
         expectation_maximisation(Shard(x), Progress(components, start.reseeded, start.log_likelihood), 5, 0.0, 0.0)
+    x = torch.cat([x, x[:, :1]], 1)  # a column twice
+    with pytest.raises(IndefiniteCovariance, match="collapsed 1 times"):
+        start_components(Shard(x), 3, 0, 0.0)
 
 
 def test_a_collapsed_component_is_placed_anew_and_the_fit_recovers():
@@ -155,10 +150,3 @@ def test_a_component_is_placed_anew_three_times_and_no_more():
         torch.testing.assert_close(apart, spread[-1].sqrt() * axes[:, -1].abs())
     with pytest.raises(IndefiniteCovariance, match=r"component 2, of 0\.0 rows, collapsed 4 times"):
         maximisation(sums, len(x), 0.0, torch.tensor([0, 0, MAX_RESEEDS]))
-
-
-def test_data_that_span_no_covariance_are_an_error_at_once():
-    x = clustered()
-    x = torch.cat([x, x[:, :1]], 1)  # a column twice
-    with pytest.raises(IndefiniteCovariance, match="collapsed 1 times"):
-        start_components(Shard(x), 3, 0, 0.0)

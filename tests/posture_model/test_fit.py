@@ -24,7 +24,7 @@ def banana(n: int = 4000, unit: float = 1.0) -> HandSamples:
     return HandSamples(torch.from_numpy(joints), q, ("a", "b"), {"hand": "toy", "seed": "4"})
 
 
-def test_eq20_fit_reports_what_it_did():
+def test_eq20_fit_reports_what_it_did_and_the_bic_of_one_gaussian_in_closed_form():
     samples = banana()
     mixture = fit_mixture(samples, 8)
     assert mixture.names == ("a", "b", "L1", "L2", "L3", "N1", "N2", "N3")
@@ -36,9 +36,6 @@ def test_eq20_fit_reports_what_it_did():
     assert math.isclose(float(mixture.meta["log_likelihood"]), mean, abs_tol=1e-5)
     # The mixture has the mean of its data: a property of every step of EM.
     torch.testing.assert_close(mixture.weights @ mixture.means, samples.rows().mean(0), rtol=1e-6, atol=1e-6)
-
-
-def test_eq20_bic_of_one_gaussian_is_closed_form():
     samples = banana(500)
     mixture = fit_mixture(samples, 1, regularisation=0.0)
     covariance = torch.cov(samples.rows().T, correction=0)
@@ -48,14 +45,11 @@ def test_eq20_bic_of_one_gaussian_is_closed_form():
     torch.testing.assert_close(mixture.covariances[0], covariance)
 
 
-def test_eq23_more_components_predict_better():
+def test_eq23_more_components_predict_better_and_units_do_not_matter():
     train, test = banana(), banana(1000)
     errors = [float((fit_mixture(train, m).joints(test.q) - test.joints).abs().mean()) for m in (1, 4, 16)]
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 0.1
-
-
-def test_units_do_not_matter():
     metres, millimetres = fit_mixture(banana(), 5), fit_mixture(banana(unit=1e-3), 5)
     unit = torch.tensor([1.0, 1, 1e3, 1e3, 1e3, 1, 1, 1], dtype=torch.float64)
     torch.testing.assert_close(metres.weights, millimetres.weights, rtol=1e-6, atol=1e-9)
@@ -63,14 +57,10 @@ def test_units_do_not_matter():
     torch.testing.assert_close(metres.covariances * unit[:, None] * unit, millimetres.covariances, rtol=1e-5, atol=1e-9)
 
 
-def test_same_seed_same_mixture():
+def test_same_seed_same_mixture_and_the_likeliest_of_several_starts_goes_on():
     samples = banana(1500)
     first, second = fit_mixture(samples, 4, seed=2), fit_mixture(samples, 4, seed=2)
     assert torch.equal(first.covariances, second.covariances)
-
-
-def test_the_likeliest_of_several_starts_goes_on():
-    samples = banana(1500)
     alone = [fit_mixture(samples, 6, seed=seed, iterations=TRIAL_STEPS, tolerance=0.0) for seed in (2, 3, 4)]
     best = max(alone, key=lambda mixture: float(mixture.meta["log_likelihood"]))
     together = fit_mixture(samples, 6, seed=2, iterations=TRIAL_STEPS, tolerance=0.0, starts=3)

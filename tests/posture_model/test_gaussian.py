@@ -46,41 +46,29 @@ def test_eq19_log_prob_equals_scikit_learn_and_scipy(generator):
 
 
 @pytest.mark.parametrize("names", [s for k in (1, 2, 3) for s in itertools.permutations(NAMES, k)])
-def test_eq22_every_marginal_is_the_density_of_a_part(names, generator):
-    mixture = random_mixture()
-    index = [NAMES.index(name) for name in names]
+def test_eq22_every_marginal_is_the_density_of_a_part_and_eq23_every_conditional_joint_over_marginal(names, generator):
+    mixture, index = random_mixture(), [NAMES.index(name) for name in names]
     x = torch.randn(5, len(names), generator=generator, dtype=torch.float64)
     density = sum(
         float(w) * scipy.stats.multivariate_normal(mean[index].numpy(), s[index][:, index].numpy()).pdf(x.numpy())
         for w, mean, s in zip(mixture.weights, mixture.means, mixture.covariances, strict=True)
     )
     np.testing.assert_allclose(mixture.marginal(names).log_prob(x).exp(), density, rtol=1e-9)
+    values, rest = x[0], [k for k in range(4) if k not in index]
+    result = mixture.condition(dict(zip(names, values.tolist(), strict=True)))
+    assert result.names == tuple(NAMES[k] for k in rest)
+    whole = torch.randn(6, 4, generator=generator, dtype=torch.float64)
+    whole[:, index] = values
+    bayes = mixture.log_prob(whole) - mixture.marginal(names).log_prob(values)
+    torch.testing.assert_close(result.log_prob(whole[:, rest]), bayes, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("observed", [s for k in (1, 2, 3) for s in itertools.permutations(NAMES, k)])
-def test_eq23_every_conditional_is_joint_over_marginal(observed, generator):
-    mixture = random_mixture()
-    values = torch.randn(len(observed), generator=generator, dtype=torch.float64)
-    result = mixture.condition(dict(zip(observed, values.tolist(), strict=True)))
-    rest = tuple(name for name in NAMES if name not in observed)
-    assert result.names == rest
-    x = torch.randn(6, len(rest), generator=generator, dtype=torch.float64)
-    whole = torch.zeros(6, 4, dtype=torch.float64)
-    whole[:, [NAMES.index(name) for name in rest]] = x
-    whole[:, [NAMES.index(name) for name in observed]] = values
-    bayes = mixture.log_prob(whole) - mixture.marginal(observed).log_prob(values)
-    torch.testing.assert_close(result.log_prob(x), bayes, rtol=1e-9, atol=1e-9)
-
-
-def test_conditions_one_after_the_other_are_both_at_once():
+def test_conditions_one_after_the_other_are_both_at_once_and_far_ones_leave_some_components():
     mixture = random_mixture()
     both, after = mixture.condition({"a": 0.3, "d": -1.0}), mixture.condition({"d": -1.0}).condition({"a": 0.3})
     for name in ("weights", "means", "covariances"):
         torch.testing.assert_close(getattr(both, name), getattr(after, name))
     assert mixture.condition({}).names == NAMES
-
-
-def test_an_observation_far_away_leaves_the_components_that_allow_it():
     mixture = random_mixture(seed=5)
     result = mixture.condition({"b": 1e3})
     assert 1 <= len(result.weights) <= 3
@@ -88,7 +76,7 @@ def test_an_observation_far_away_leaves_the_components_that_allow_it():
     assert math.isclose(float(result.weights.sum()), 1.0, rel_tol=1e-12)
 
 
-def test_samples_have_the_density_of_the_mixture():
+def test_samples_have_the_density_of_the_mixture_and_touch_no_global_generator():
     mixture, n = random_mixture(), 200_000
     x = mixture.sample(n, seed=1)
     assert torch.equal(x, mixture.sample(n, seed=1))
@@ -112,9 +100,6 @@ def test_samples_have_the_density_of_the_mixture():
 
         assert scipy.stats.kstest(x[:20_000, k].numpy(), below).pvalue > 1e-4
     assert mixture.sample(0).shape == (0, 4)
-
-
-def test_sampling_touches_no_global_generator():
     state = torch.random.get_rng_state()
     random_mixture().sample(10)
     assert torch.equal(state, torch.random.get_rng_state())

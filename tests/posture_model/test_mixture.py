@@ -29,20 +29,21 @@ def gaussians(mixture: GraspMixture) -> list[torch.distributions.MultivariateNor
     return [torch.distributions.MultivariateNormal(mean, covariance) for mean, covariance in pairs]
 
 
-def test_eq19_log_prob_is_the_density_of_the_mixture(generator):
+def test_eq19_log_prob_is_the_density_and_eq21_energy_half_the_least_mahalanobis_distance(generator):
     mixture = random_mixture(5)
     x = 2 * torch.randn(40, 3, 8, generator=generator, dtype=torch.float64)
     density = torch.stack([g.log_prob(x).exp() for g in gaussians(mixture)], -1) @ mixture.weights
     torch.testing.assert_close(mixture.log_prob(x), density.log(), rtol=1e-9, atol=1e-9)
-
-
-def test_eq21_eq22_energy_is_half_the_least_squared_mahalanobis_distance(generator):
     mixture = random_mixture(4)
     q = torch.randn(30, 6, 6, generator=generator, dtype=torch.float64)
     each = []
     for mean, covariance in zip(mixture.means[:, 2:], mixture.covariances[:, 2:, 2:], strict=True):
         each.append(0.5 * torch.einsum("...i,ij,...j->...", q - mean, torch.linalg.inv(covariance), q - mean))
     torch.testing.assert_close(mixture.energy(q), torch.stack(each).amin(0), rtol=1e-9, atol=1e-9)
+    mixture = random_mixture(3)
+    q = torch.randn(10, 6, generator=torch.Generator().manual_seed(2))
+    assert mixture.energy(q).dtype == torch.float32
+    torch.testing.assert_close(mixture.energy(q), mixture.energy(q.double()).float())
 
 
 @pytest.mark.promise("N12")
@@ -72,7 +73,7 @@ def test_eq23_conditional_mean_is_brute_force_bayes():
         torch.testing.assert_close(result, weight @ grid, rtol=1e-9, atol=1e-9)
 
 
-def test_eq23_modes_recover_the_mean_and_come_in_order(generator):
+def test_eq23_modes_recover_the_mean_in_order_and_codes_far_away_or_nan_spoil_no_other(generator):
     mixture = random_mixture(5)
     q = torch.randn(7, 2, 6, generator=generator, dtype=torch.float64)
     joints, weights = mixture.modes(q, 5)
@@ -83,17 +84,10 @@ def test_eq23_modes_recover_the_mean_and_come_in_order(generator):
     torch.testing.assert_close(mixture.modes(q, 2)[0], joints[..., :2, :])
     with pytest.raises(BadArgument, match=r"k: expected .*got 6"):
         mixture.modes(q, 6)
-
-
-def test_a_code_far_from_everything_still_has_its_nearest_component():
     mixture = random_mixture(3)
     joints, weights = mixture.modes(torch.full((1, 6), 1e4, dtype=torch.float64), 1)
     assert bool(joints.isfinite().all())
     torch.testing.assert_close(weights, torch.ones_like(weights))
-
-
-def test_nan_codes_stay_nan_and_spoil_no_other_row():
-    mixture = random_mixture(3)
     q = torch.zeros(2, 6, dtype=torch.float64)
     q[0] = float("nan")
     assert mixture.energy(q).isnan().tolist() == [True, False]
@@ -102,14 +96,7 @@ def test_nan_codes_stay_nan_and_spoil_no_other_row():
     assert mixture.joints(torch.zeros(0, 6)).shape == (0, 2)
 
 
-def test_float32_codes_are_evaluated_in_float64():
-    mixture = random_mixture(3)
-    q = torch.randn(10, 6, generator=torch.Generator().manual_seed(2))
-    assert mixture.energy(q).dtype == torch.float32
-    torch.testing.assert_close(mixture.energy(q), mixture.energy(q.double()).float())
-
-
-def test_save_and_load_give_the_same_mixture(tmp_path):
+def test_save_and_load_give_the_same_mixture_and_other_files_are_refused(tmp_path):
     mixture = random_mixture(3)
     path = mixture.save(tmp_path / "hand.safetensors")
     again = load_mixture(path)
@@ -117,6 +104,18 @@ def test_save_and_load_give_the_same_mixture(tmp_path):
         assert torch.equal(getattr(mixture, name), getattr(again, name))
     assert (again.names, again.regularisation, again.meta) == (mixture.names, mixture.regularisation, mixture.meta)
     assert again.joint_names == ("a", "b")
+    save_file(tensors_of(random_mixture(2)), tmp_path / "plain.safetensors")
+    (tmp_path / "text.safetensors").write_text("no tensors")
+    for name in ("plain", "text", "missing"):
+        with pytest.raises(ModelFileError):
+            load_mixture(tmp_path / f"{name}.safetensors")
+    good = random_mixture(2)
+    with pytest.raises(BadArgument, match="weights"):
+        GraspMixture(good.weights * 0.9, good.means, good.covariances, NAMES)
+    with pytest.raises(BadArgument, match="names"):
+        GraspMixture(good.weights, good.means, good.covariances, tuple("abcdefgh"))
+    with pytest.raises(BadArgument, match=r"x: expected .*got shape"):
+        good.log_prob(torch.zeros(3, 5))
 
 
 def tensors_of(mixture: GraspMixture) -> dict[str, torch.Tensor]:
@@ -153,21 +152,3 @@ def test_missing_metadata_is_refused(tmp_path, meta):
     path = save_tensors(tmp_path / "hand.safetensors", "mixture", tensors_of(random_mixture(3)), meta)
     with pytest.raises(ModelFileError):
         load_mixture(path)
-
-
-def test_other_files_are_refused(tmp_path):
-    save_file(tensors_of(random_mixture(2)), tmp_path / "plain.safetensors")
-    (tmp_path / "text.safetensors").write_text("no tensors")
-    for name in ("plain", "text", "missing"):
-        with pytest.raises(ModelFileError):
-            load_mixture(tmp_path / f"{name}.safetensors")
-
-
-def test_bad_mixtures_do_not_exist():
-    good = random_mixture(2)
-    with pytest.raises(BadArgument, match="weights"):
-        GraspMixture(good.weights * 0.9, good.means, good.covariances, NAMES)
-    with pytest.raises(BadArgument, match="names"):
-        GraspMixture(good.weights, good.means, good.covariances, tuple("abcdefgh"))
-    with pytest.raises(BadArgument, match=r"x: expected .*got shape"):
-        good.log_prob(torch.zeros(3, 5))

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
+from torchgrasp import load_hand, sample_configurations
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.load import load_hand
 from torchgrasp.posture_model.mixture import encode_fingertips
-from torchgrasp.posture_model.sample import sample_configurations
 
 
 @pytest.fixture(autouse=True)

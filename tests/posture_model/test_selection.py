@@ -7,10 +7,9 @@ import pytest
 import torch
 from paper.cross_validation import cross_validate
 
+from torchgrasp import fit_mixture
 from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model.fit import fit_mixture
-from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY
-from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.posture_model import DEFAULT_ENERGY, PAPER_ENERGY, HandSamples
 from torchgrasp.posture_model.score import bic_curve, evaluate_mixture
 
 
@@ -22,16 +21,13 @@ def islands(n: int = 1500, m: int = 4) -> HandSamples:
     return HandSamples(torch.from_numpy(x[:, :2]), torch.from_numpy(x[:, 2:]), ("a", "b"))
 
 
-def test_bic_finds_the_number_of_true_components():
+def test_bic_is_that_of_the_fit_and_finds_the_number_of_true_components():
     observed = []
     curve = bic_curve(islands(), (1, 2, 3, 4, 5, 6), observer=lambda m, mixture: observed.append(m))
     assert observed == [1, 2, 3, 4, 5, 6]
     assert int(curve.components[curve.bic.argmin()]) == 4
     assert str(curve).endswith("least at 4")
     assert str(bic_curve(islands(), (1, 2))).endswith("no minimum is seen")
-
-
-def test_bic_of_the_curve_is_that_of_the_fit():
     samples = islands()
     curve = bic_curve(samples, (2,), seed=3)
     log_likelihood = float(fit_mixture(samples, 2, seed=3).log_prob(samples.rows()).sum())

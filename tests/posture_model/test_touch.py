@@ -10,9 +10,8 @@ import torch
 from scipy.optimize import linprog
 from scipy.stats import kstest, rayleigh
 
-from torchgrasp.hand.load import load_hand
+from torchgrasp import ContactSpec, load_hand
 from torchgrasp.posture_model.sample import ROLL, can_close, roll_contacts, sample_configurations
-from torchgrasp.specs import ContactSpec
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -67,7 +66,7 @@ def closes(points: np.ndarray, inward: np.ndarray, friction: float, edges: int =
     return result.x[-1] if result.status == 0 else 0.0
 
 
-def test_eq13_closing_triples_are_those_of_a_linear_program():
+def test_eq13_closing_triples_are_those_of_a_linear_program_and_more_contacts_close_by_three(generator):
     hand, friction = load_hand("barrett"), ContactSpec().friction
     points, normals = roll_contacts(hand, sample_configurations(hand, 3000, seed=6).joints, np.random.default_rng(1))
     closed = can_close(points, normals)
@@ -76,9 +75,6 @@ def test_eq13_closing_triples_are_those_of_a_linear_program():
     margin = np.array([closes(points[k].numpy(), normals[k].numpy(), friction) for k in rows.tolist()])
     assert (margin[:40] > 0).all()  # what balances does close
     assert (margin[40:] > 0.02).mean() < 0.02  # and of the others only narrow ones do
-
-
-def test_eq13_more_contacts_close_if_three_of_them_do(generator):
     points, normals = torch.randn(2, 300, 5, 3, generator=generator, dtype=torch.float64)
     normals = normals / normals.norm(dim=-1, keepdim=True)
     by_three = [can_close(points[:, k], normals[:, k]) for k in map(list, itertools.combinations(range(5), 3))]

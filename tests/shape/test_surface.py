@@ -8,14 +8,12 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import cup_view
+from tests.make import cup_view, near, real
+from torchgrasp import PointCloud, ShapeGP, fit_shape
 from torchgrasp.errors import BadArgument
-from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import _grid, extract_mesh, extract_surface
-from torchgrasp.values import PointCloud
 
-RADIUS, CENTER = 0.04, torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
+RADIUS, CENTER = 0.04, real([0.2, -0.1, 0.3])
 
 
 @pytest.fixture(scope="module")
@@ -29,21 +27,20 @@ def test_eq9_surface_is_the_zero_level_closed_and_wound_outward(ball: ShapeGP):
     surface = extract_surface(ball, resolution=24)
     found = ball.predict(surface.vertices)
     assert found.distance.abs().max() < 1e-6
-    torch.testing.assert_close(surface.normals, found.normal, rtol=0, atol=1e-6)
+    near(surface.normals, found.normal, 1e-6)
     torch.testing.assert_close(surface.std_m, found.std_m, rtol=1e-4, atol=1e-7)
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
     assert mesh.is_watertight and mesh.body_count == 1
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.1)
     assert np.abs(np.linalg.norm(mesh.vertices - CENTER.numpy(), axis=1) - RADIUS).max() < 0.002
+    mesh, surface = extract_mesh(ball), extract_surface(ball)
+    assert torch.equal(mesh.vertices, surface.vertices) and torch.equal(mesh.faces, surface.faces)
 
 
-def test_a_finer_grid_gives_more_triangles_on_the_same_surface(ball: ShapeGP):
+def test_a_finer_grid_gives_more_triangles_and_the_surface_carries_the_cloud(ball: ShapeGP, seen_cylinder: PointCloud):
     coarse, fine = extract_surface(ball, 16), extract_surface(ball, 32)
     assert len(fine.faces) > 3 * len(coarse.faces)
     assert torch.cdist(coarse.vertices, fine.vertices).amin(1).max() < 0.006
-
-
-def test_surface_carries_the_cloud_of_one_view(seen_cylinder: PointCloud):
     surface = extract_surface(fit_shape(seen_cylinder, table=0.0), resolution=32)
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
     _, distance, _ = trimesh.proximity.closest_point(mesh, seen_cylinder.points[::10].numpy())
@@ -70,11 +67,6 @@ def test_the_grid_is_the_mean_wherever_the_surface_passes(
         across = sign[1:] != sign[:-1]
         assert sure[1:][across].all() and sure[:-1][across].all()
     assert exact.mean() < 0.6
-
-
-def test_a_mesh_alone_is_that_of_the_surface(ball: ShapeGP):
-    mesh, surface = extract_mesh(ball), extract_surface(ball)
-    assert torch.equal(mesh.vertices, surface.vertices) and torch.equal(mesh.faces, surface.faces)
 
 
 def test_both_walls_of_a_vessel_are_wound_outward():

@@ -9,9 +9,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tests.laws.scenes import check_scene
+from torchgrasp import load_hand
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
-from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.mujoco_scene import OBJECT
 from torchgrasp.sim.scene_spec import (
     APPROACH_JOINT,
@@ -37,7 +37,7 @@ def mounted(urdf_path, **options):
     return mounted_urdf(SceneSpec(urdf_path, np.eye(4), {}, {}, (), ball, [ball], 0.1, **options))
 
 
-def test_mounted_urdf_has_geometry_and_mount_joints():
+def test_mounted_urdf_has_geometry_and_mount_joints_and_refuses_files_that_are_no_hand(tmp_path):
     path = load_hand("barrett").urdf_path
     assert APPROACH_JOINT not in mounted(path)
     text = mounted(path, approach=(0.0, 0.06, -0.08))
@@ -46,9 +46,8 @@ def test_mounted_urdf_has_geometry_and_mount_joints():
     assert "<mimic" not in text
     assert "<visual" not in text
     assert text.count("<collision") > 5
-
-
-def test_mounted_urdf_refuses_files_that_are_no_hand(tmp_path):
+    assert not any(name in mounted(path) for name in SHIFT_JOINTS)
+    assert all(name in mounted(path, yields=0.02) for name in SHIFT_JOINTS)
     with pytest.raises(HandFileError):
         mounted(tmp_path / "none.urdf")
     (tmp_path / "two.urdf").write_text('<robot name="r"><link name="a"/><link name="b"/></robot>')
@@ -195,9 +194,3 @@ def test_yielding_mount_shifts_and_lifts_the_hand(simulator):
     moved = scene.hand_pose() - world_from_hand.numpy()
     assert moved[:3, 3] == pytest.approx([0.02, -0.01, 0.055], abs=1e-4)
     assert np.abs(moved[:3, :3]).max() < 1e-5
-
-
-def test_mounted_urdf_has_shift_joints_only_if_the_mount_yields():
-    path = load_hand("barrett").urdf_path
-    assert not any(name in mounted(path) for name in SHIFT_JOINTS)
-    assert all(name in mounted(path, yields=0.02) for name in SHIFT_JOINTS)

@@ -1,21 +1,15 @@
-"""The same pinched cylinder in both simulators: held in both, with the same forces, and each repeats itself."""
+"""The same pinched cylinder in both simulators: held in both, with the same forces."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-import torch
 
-from tests.pinch import QUICK as QUICK_SAPIEN
-from tests.pinch import close, cylinder, digest, digest_elsewhere, pinch
-from torchgrasp.errors import Status
-from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.evaluation.protocols import PROTOCOLS
-from torchgrasp.evaluation.pull import pull_grasp
-from torchgrasp.evaluation.trial import GraspTrial
+from tests.pinch import QUICK, close, cylinder, pinch, quick_trial
+from torchgrasp import Status, close_hand
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, pull_grasp
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
-QUICK = dataclasses.replace(QUICK_SAPIEN, simulator="mujoco")
 PULL = PROTOCOLS["dexgraspbench"].with_trial(mass=0.05)
 PULL = dataclasses.replace(PULL, pull=dataclasses.replace(PULL.pull, seconds=0.2))
 
@@ -36,24 +30,6 @@ def test_simulators_hold_a_cylinder_with_equal_forces(name):
     assert set(here.joint_names) == set(there.joint_names)
 
 
-@pytest.mark.promise("N15")
-def test_mujoco_gives_the_same_bits_in_another_process():
-    first = digest(close("allegro", spec=QUICK, seed=3))
-    assert first == digest(close("allegro", spec=QUICK, seed=3))
-    assert first != digest(close("allegro", spec=QUICK, seed=4))
-    assert first == digest_elsewhere("allegro", "mujoco", 3)
-
-
-def test_mujoco_reports_overlap_and_missing_contact():
-    forward = torch.eye(4, dtype=torch.float64)
-    forward[2, 3] = 0.2
-    assert close("barrett", spec=QUICK, error=forward).status is Status.START_OVERLAP
-    forward[2, 3] = -0.4
-    assert close("barrett", spec=QUICK, error=forward).status is Status.NO_CONTACT
-    slippery = dataclasses.replace(QUICK, friction=0.02)
-    assert not close("allegro", spec=slippery).held
-
-
 @pytest.mark.parametrize("pull", [10.0, 300.0])
 def test_simulators_agree_on_a_pull(pull):
     hand, grasp = pinch("allegro")
@@ -65,13 +41,12 @@ def test_simulators_agree_on_a_pull(pull):
 
 
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
-@pytest.mark.parametrize(("effort", "held"), [(0.01, False), (0.7, True)])
-def test_simulators_report_drives_that_are_too_weak(simulator, effort, held):
+def test_simulators_report_drives_that_are_too_weak(simulator):
     hand, grasp = pinch("allegro")
-    drives = {name: drive._replace(effort=effort) for name, drive in hand.actuators.items()}
+    drives = {name: drive._replace(effort=0.01) for name, drive in hand.actuators.items()}
     spec = dataclasses.replace(QUICK, simulator=simulator)
     result = close_hand(grasp, dataclasses.replace(hand, actuators=drives), cylinder(), spec)
-    assert result.status is (Status.OK if held else Status.TOO_WEAK)
+    assert result.status is Status.TOO_WEAK and quick_trial("allegro", simulator).status is Status.OK
 
 
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])

@@ -37,7 +37,7 @@ def energy(points: torch.Tensor, rest: torch.Tensor, turned: torch.Tensor) -> to
     return 0.5 * TRANSLATION_STIFFNESS * slide + ROTATION_STIFFNESS * turn
 
 
-def test_shared_forces_are_the_smallest_for_the_wrench():
+def test_shared_forces_are_the_smallest_for_the_wrench_and_spring_forces_balance():
     points = triangles(20)
     wrench = torch.randn(20, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     forces = shared_forces(points, wrench, torch.full((20,), 1e9).double())
@@ -49,10 +49,6 @@ def test_shared_forces_are_the_smallest_for_the_wrench():
     capped = shared_forces(points, wrench, torch.full((20,), 0.1).double())
     assert torch.allclose(capped.norm(dim=-1).amax(-1), torch.tensor(0.1).double())
     assert torch.allclose(capped / capped.norm(), forces / forces.norm(), atol=1.0)
-
-
-def test_spring_forces_balance_and_pull_together():
-    points = triangles(20)
     stiffness = torch.tensor([10.0, 200.0, 70.0]).double().expand(20, 3)
     forces = spring_forces(points, side_lengths(points) - 0.01, stiffness)
     assert wrench_of(points, forces).abs().max() < 1e-12
@@ -88,7 +84,7 @@ def test_impedance_at_rest_presses_with_the_desired_forces():
     assert torch.allclose(2.0 * last.reshape(3, 3), forces, atol=1e-9)
 
 
-def test_impedance_restores_a_moved_grasp():
+def test_impedance_restores_a_moved_grasp_in_any_frame_and_keeps_its_own_for_tips_on_a_line():
     seen = observation(0.0, contact=TOUCHING, reading=(2.0, 2.0, 4.0))
     hold = Impedance(reference(), seen, torch.zeros(9).double())
     tips, rest = seen.tips, hold.forces(seen.tips)
@@ -101,25 +97,16 @@ def test_impedance_restores_a_moved_grasp():
     assert float(torque[2]) == pytest.approx(-ROTATION_STIFFNESS * 0.05, rel=0.01)
     far = hold.forces(tips + 100 * shift) - rest
     assert float(far.norm(dim=-1).max()) == pytest.approx(float(rest.norm(dim=-1).max()))
-
-
-def test_impedance_forces_turn_with_the_frame():
     seen = observation(0.0, contact=TOUCHING)
-    hold = Impedance(reference(), seen, torch.zeros(9).double())
-    moved = seen.tips + 0.002 * triangles(1, 3)[0] / 0.05
-    there = rigid(rotation_from_vector(real([0.5, 0.2, -0.8])), real([0.1, 0.0, 0.2]))
-    turned = Impedance(reference(), seen, torch.zeros(9).double())
-    turned.rest = there @ hold.rest
-    forces = turned.forces(moved @ there[:3, :3].T + there[:3, 3])
-    assert torch.allclose(forces, hold.forces(moved) @ there[:3, :3].T, atol=1e-9)
-
-
-def test_impedance_keeps_its_frame_for_tips_on_a_line():
-    seen = observation(0.0, contact=TOUCHING)
-    hold = Impedance(reference(), seen, torch.zeros(9).double())
+    hold, turned = (Impedance(reference(), seen, torch.zeros(9).double()) for _ in range(2))
     line = seen.tips.mean(0) + torch.arange(3)[:, None] * real([0.01, 0.0, 0.0])
     assert torch.isfinite(hold.forces(line)).all()
     assert torch.equal(hold.frame, hold.rest)
+    moved = seen.tips + 0.002 * triangles(1, 3)[0] / 0.05
+    there = rigid(rotation_from_vector(real([0.5, 0.2, -0.8])), real([0.1, 0.0, 0.2]))
+    turned.rest = there @ hold.rest
+    forces = turned.forces(moved @ there[:3, :3].T + there[:3, 3])
+    assert torch.allclose(forces, hold.forces(moved) @ there[:3, :3].T, atol=1e-9)
 
 
 def test_impedance_firms_an_unstable_grasp_only():

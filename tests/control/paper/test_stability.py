@@ -6,17 +6,10 @@ import pytest
 import torch
 from train.stability import fit_stability
 
-from torchgrasp.control.paper.stability import (
-    LEAST_FORCE,
-    NAMES,
-    StabilityModel,
-    lengths_of,
-    load_stability,
-    state_of,
-)
+from torchgrasp import load_hand
+from torchgrasp.control.paper.stability import LEAST_FORCE, NAMES, StabilityModel, lengths_of, load_stability, state_of
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.geometry.frames import rotation_from_vector
-from torchgrasp.hand.load import load_hand
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
 
 
@@ -86,7 +79,7 @@ def test_preferred_forces_are_the_regression_on_the_lengths(model: StabilityMode
         model.preferred_forces(tips(float("nan")))
 
 
-def test_stability_file_is_read_back_and_refused_for_another_hand(model: StabilityModel, tmp_path):
+def test_stability_file_is_read_back_and_refused_for_another_hand_or_a_bad_fit(model: StabilityModel, tmp_path):
     path = model.save(tmp_path / "stability.safetensors")
     assert path.stat().st_size < 100_000
     again = load_stability(load_hand("allegro"), path)
@@ -99,6 +92,12 @@ def test_stability_file_is_read_back_and_refused_for_another_hand(model: Stabili
     (tmp_path / "broken.safetensors").write_bytes(path.read_bytes()[:200])
     with pytest.raises(ModelFileError):
         load_stability(load_hand("allegro"), tmp_path / "broken.safetensors")
+    with pytest.raises(BadArgument, match="components"):
+        fit_stability(states(20, 2.0, 0), states(20, 1.0, 1), 4)
+    with pytest.raises(BadArgument, match="share"):
+        dataclasses.replace(model, share=1.0)
+    with pytest.raises(BadArgument, match="names"):
+        dataclasses.replace(model, stable=model.stable.marginal(NAMES[:6]))
 
 
 def test_load_stability_finds_the_shipped_models():
@@ -115,12 +114,3 @@ def test_load_stability_finds_the_shipped_models():
             for factor in (1.0, 0.25)
         )
         assert float(firm) > 0 > float(weak)
-
-
-def test_fit_stability_refuses_bad_fits(model: StabilityModel):
-    with pytest.raises(BadArgument, match="components"):
-        fit_stability(states(20, 2.0, 0), states(20, 1.0, 1), 4)
-    with pytest.raises(BadArgument, match="share"):
-        dataclasses.replace(model, share=1.0)
-    with pytest.raises(BadArgument, match="names"):
-        dataclasses.replace(model, stable=model.stable.marginal(NAMES[:6]))

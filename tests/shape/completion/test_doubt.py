@@ -13,10 +13,10 @@ import pytest
 import torch
 import trimesh
 
+from tests.make import real
+from torchgrasp import cloud_from_depth, fit_shape
 from torchgrasp.cloud import look_at, partial_view
-from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.errors import CutOff, Gap, TwoBodies
-from torchgrasp.shape.fit import fit_shape
 
 PATH = {"PYTHONPATH": str(Path(__file__).parents[3])}
 
@@ -36,8 +36,8 @@ CAN = on_table(trimesh.creation.cylinder(0.04, 0.14))
 def cut_view(mesh, beyond):
     """A view of which the image ends at a plane through the camera and x = y = 0 there, `beyond` m to the side."""
     whole = partial_view(mesh, look_at(0.0, 20.0, target=mesh), n=1000, noise=False)
-    ray = torch.tensor([0.0, beyond, 0.07], dtype=torch.float64) - whole.viewpoint
-    side = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    ray = real([0.0, beyond, 0.07]) - whole.viewpoint
+    side = real([0.0, -1.0, 0.0])
     side = side - (side @ ray) / (ray @ ray) * ray
     sides = torch.stack([side, ray, ray, ray])
     inside = (whole.points - whole.viewpoint) @ side > 0
@@ -58,16 +58,13 @@ def test_beyond_the_border_of_the_image_the_shape_is_told_to_be_a_guess():
     assert float((seen.distance * told.scale).abs().median()) < 0.001
 
 
-def test_a_whole_object_far_from_the_border_is_not_cut_off():
+def test_a_depth_image_that_ends_on_the_object_cuts_it_off_and_a_whole_one_does_not():
     pose = look_at(30.0, 25.0, target=BOX)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         whole = partial_view(BOX, pose, n=600)
         shape = fit_shape(whole, table=0.0)
     assert whole.frustum is not None and shape.std_factor < 1.0
-
-
-def test_a_depth_image_that_ends_on_the_object_cuts_it_off():
     size, focal = 120, 300.0
     v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
     ball = 0.5 + 0.0 * u
@@ -81,7 +78,7 @@ def test_a_depth_image_that_ends_on_the_object_cuts_it_off():
 
 def test_a_gap_in_a_face_is_neither_a_hole_nor_a_sure_surface():
     view = partial_view(BOX, look_at(30.0, 25.0, target=BOX), n=1000)
-    face = torch.tensor([0.04, 0.0, 0.06], dtype=torch.float64)
+    face = real([0.04, 0.0, 0.06])
     away = torch.linalg.vector_norm(view.points - face, dim=1)
     with pytest.warns(Gap, match="a gap of 3. mm"):
         shape = fit_shape(view.select(away > 0.02), table=0.0)
@@ -93,12 +90,17 @@ def test_a_gap_in_a_face_is_neither_a_hole_nor_a_sure_surface():
     assert float(inside.std_m.median()) > 1.5 * float(sure.std_m.median())
 
 
-def test_a_hole_that_is_seen_through_is_no_surface():
+def test_a_hole_that_is_seen_through_is_no_surface_and_two_bodies_are_told():
     ring = on_table(trimesh.creation.torus(0.04, 0.012))
     with pytest.warns(Gap):
         shape = fit_shape(partial_view(ring, look_at(30.0, 60.0, target=ring), n=1000), table=0.0)
-    middle = shape.predict(torch.tensor([[0.0, 0.0, 0.012], [0.01, 0.0, 0.012]], dtype=torch.float64))
+    middle = shape.predict(real([[0.0, 0.0, 0.012], [0.01, 0.0, 0.012]]))
     assert bool((middle.distance * shape.scale > 0.01).all())
+    other = trimesh.creation.box([0.05, 0.05, 0.06])
+    other.apply_translation([0.0, 0.13, 0.03])
+    both = trimesh.util.concatenate([BOX, other])
+    with pytest.warns(TwoBodies, match="two bodies that stand apart"):
+        fit_shape(partial_view(both, look_at(30.0, 40.0, target=both), n=1000), table=0.0)
 
 
 def test_a_warning_names_the_line_of_the_caller(tmp_path):
@@ -114,11 +116,3 @@ def test_a_warning_names_the_line_of_the_caller(tmp_path):
     script.write_text("\n".join(lines))
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=os.environ | PATH)
     assert f"{script}:5: TwoBodies: two bodies" in done.stderr
-
-
-def test_two_bodies_are_told():
-    other = trimesh.creation.box([0.05, 0.05, 0.06])
-    other.apply_translation([0.0, 0.13, 0.03])
-    both = trimesh.util.concatenate([BOX, other])
-    with pytest.warns(TwoBodies, match="two bodies that stand apart"):
-        fit_shape(partial_view(both, look_at(30.0, 40.0, target=both), n=1000), table=0.0)

@@ -4,20 +4,20 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.make import real
+from torchgrasp import PointCloud, fit_shape
 from torchgrasp.geometry.linalg import fibonacci_sphere, unit
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.ellipsoid import Ellipsoid, find_ellipsoid
 from torchgrasp.shape.completion.silhouette import silhouettes
-from torchgrasp.shape.fit import fit_shape
-from torchgrasp.values import PointCloud
 
-CAMERA = torch.tensor([0.35, 0.2, 0.4], dtype=torch.float64)
+CAMERA = real([0.35, 0.2, 0.4])
 
 
 def _fruit(axes: tuple[float, float, float], noise: float = 0.0005) -> PointCloud:
     """The seen side of an ellipsoid that lies on z = 0."""
-    axis = torch.tensor(axes, dtype=torch.float64)
-    center = torch.tensor([0.01, -0.02, axes[2]], dtype=torch.float64)
+    axis = real(axes)
+    center = real([0.01, -0.02, axes[2]])
     direction = fibonacci_sphere(3000)
     points, normals = center + axis * direction, unit(direction / axis)
     generator = torch.Generator().manual_seed(5)
@@ -33,8 +33,8 @@ def _find(cloud: PointCloud, table: float | None) -> Ellipsoid | None:
 
 def _off(points: Tensor, axes: tuple[float, float, float]) -> Tensor:
     """Distance [m] from the true ellipsoid, to first order."""
-    axis = torch.tensor(axes, dtype=torch.float64)
-    local = (points - torch.tensor([0.01, -0.02, axes[2]], dtype=torch.float64)) / axis
+    axis = real(axes)
+    local = (points - real([0.01, -0.02, axes[2]])) / axis
     length = torch.linalg.vector_norm(local, dim=1)
     return (length - 1) * length / torch.linalg.vector_norm(local / axis, dim=1)
 
@@ -65,7 +65,7 @@ def test_a_shape_closes_where_the_ball_does(table: float | None):
     shape = fit_shape(PointCloud(cloud.points, viewpoint=CAMERA), table=table)
     direction = fibonacci_sphere(400)
     hidden = direction @ unit(CAMERA) < -0.2
-    points = torch.tensor([0.01, -0.02, radius], dtype=torch.float64) + radius * direction[hidden]
+    points = real([0.01, -0.02, radius]) + radius * direction[hidden]
     error = shape.scale * shape.predict(points).distance
     assert error.abs().median() < 0.0015 and error.median().abs() < 0.0015
 
@@ -81,7 +81,7 @@ def test_cylinders_bowls_and_long_things_are_none(seen_cylinder: PointCloud):
 def test_the_domain_holds_the_whole_ball_and_the_band_the_error():
     cloud = _fruit((0.03, 0.03, 0.03))
     shape = fit_shape(PointCloud(cloud.points, viewpoint=CAMERA), table=0.0)
-    points = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64) + 0.03 * fibonacci_sphere(400)
+    points = real([0.01, -0.02, 0.03]) + 0.03 * fibonacci_sphere(400)
     assert bool(shape.contains(points).all())
     estimate = shape.predict(points)
     assert (shape.scale * estimate.distance.abs() < 2 * estimate.std_m).double().mean() > 0.9

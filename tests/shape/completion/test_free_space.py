@@ -4,11 +4,10 @@ import math
 
 import torch
 
+from torchgrasp import PointCloud, fit_shape
 from torchgrasp.shape.completion.silhouette import silhouettes
-from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.support import free_space, free_space_violations
 from torchgrasp.shape.values import Normalisation
-from torchgrasp.values import PointCloud
 
 CENTER = torch.tensor([0.0, 0.0, 0.06], dtype=torch.float64)
 

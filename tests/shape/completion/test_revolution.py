@@ -6,11 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.make import real
+from torchgrasp import PointCloud
 from torchgrasp.shape.completion.axis import find_revolution
 from torchgrasp.shape.completion.complete import complete_cloud
-from torchgrasp.values import PointCloud
 
-CAMERA = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)
+CAMERA = real([0.45, 0.0, 0.3])
 ARM = 0.05
 
 
@@ -20,7 +21,7 @@ def _rod(azimuth: float) -> tuple[Tensor, Tensor]:
     draws = torch.rand(250, 2, dtype=torch.float64, generator=generator)
     angle = math.pi * (draws[:, 0] - 0.5)
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
-    center = torch.tensor([ARM * math.cos(azimuth), ARM * math.sin(azimuth), 0.03], dtype=torch.float64)
+    center = real([ARM * math.cos(azimuth), ARM * math.sin(azimuth), 0.03])
     return center + 0.006 * normals + torch.stack([0 * angle, 0 * angle, 0.06 * draws[:, 1]], 1), normals
 
 
@@ -37,7 +38,7 @@ def test_axis_is_found_beside_a_handle_and_through_noise(seen_cylinder: PointClo
     assert jug.normals is not None
     generator = torch.Generator().manual_seed(3)
     noise = torch.randn(2, len(jug), 3, dtype=torch.float64, generator=generator)
-    move = torch.tensor([shift, -2 * shift, 0.0], dtype=torch.float64)
+    move = real([shift, -2 * shift, 0.0])
     normals = torch.nn.functional.normalize(jug.normals + 0.05 * noise[0], dim=1)
     found = find_revolution(jug.points + 0.0005 * noise[1] + move, normals)
     assert found is not None
@@ -64,7 +65,7 @@ def test_a_handle_is_not_mirrored_to_where_the_body_hides_it(seen_cylinder: Poin
     jug = _jug(seen_cylinder, azimuth)
     found = complete_cloud(jug, table=0.0)
     level = found.points[found.points[:, 2] < 0.11, :2]
-    center = ARM * torch.tensor([math.cos(azimuth), math.sin(azimuth)], dtype=torch.float64)
+    center = ARM * real([math.cos(azimuth), math.sin(azimuth)])
     beside = torch.linalg.vector_norm(level - center, dim=1) < 0.02
     off = (torch.linalg.vector_norm(level, dim=1) - 0.03).abs()
     assert (off[~beside] < 0.004).all()

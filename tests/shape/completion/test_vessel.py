@@ -6,12 +6,12 @@ import trimesh
 
 from tests.make import CUP_HEIGHT as HEIGHT
 from tests.make import CUP_RADIUS as RADIUS
-from tests.make import cup, cup_view
+from tests.make import cup, cup_view, near, real
+from torchgrasp import PointCloud
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.shape.completion.vessel import Vessel, complete_walls, find_vessel
-from torchgrasp.values import PointCloud
 
 
 def _prepared(cloud: PointCloud) -> PointCloud:
@@ -38,10 +38,10 @@ def test_axis_wall_and_rim_of_a_noisy_cup(wall: float, elevation: float):
 def test_inner_points_are_those_within_the_cup_and_a_frame_does_not_matter():
     seen = _prepared(cup_view(0.003))
     assert seen.normals is not None
-    shift = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
+    shift = real([0.3, -0.2, 0.4])
     one, two = find_vessel(seen.points, seen.normals), find_vessel(seen.points + shift, seen.normals)
     assert one is not None and two is not None and torch.equal(one.inner, two.inner)
-    torch.testing.assert_close(two.center, one.center + shift[:2], rtol=0, atol=1e-9)
+    near(two.center, one.center + shift[:2], 1e-9)
     radius = torch.linalg.vector_norm(seen.points[:, :2], dim=1)
     below = seen.points[:, 2] < HEIGHT - 0.006
     assert bool(((radius < RADIUS - 0.0015) == one.inner)[below].double().mean() > 0.97)
