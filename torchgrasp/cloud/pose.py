@@ -85,12 +85,7 @@ def find_plausible(
 ) -> tuple[Support, ...]:
     """Return the supports that `find_table` finds; refuse a pose or a unit that the view contradicts.
 
-    Args:
-        points: everything that the camera saw [m].
-        pose: of the camera; the identity, nearly, is the camera's own frame, where any direction may be up.
-        table: a plane, or its height z [m]; None: it is found.
-        up: (3,), against gravity; None: z.
-        known_unit: whether the user stated the unit of the depth.
+    `known_unit` says whether the user stated the unit of the depth.
     """
     eye = pose[:3, 3]
     try:
