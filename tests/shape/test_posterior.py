@@ -14,6 +14,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.conditioning import append_observations, posterior_given
 from torchgrasp.shape.kernel import (
     Kernel,
+    KernelName,
     cross_covariance,
     differentiate,
     kernel_by_name,
@@ -29,7 +30,7 @@ HIDDEN = real([[-1.0, 0.0, 0.0]])
 
 
 @EVERY_KERNEL
-def test_eq7_and_eq8_joint_posterior_equals_a_dense_solve(name: str):
+def test_eq7_and_eq8_joint_posterior_equals_a_dense_solve(name: KernelName):
     known = half_sphere()
     shape = fit_half_sphere(known, name)
     points = queries(shape, 5)
@@ -62,7 +63,7 @@ def test_samples_have_the_joint_mean_and_covariance_and_repeat_with_their_seed()
 
 
 @EVERY_KERNEL
-def test_derivatives_equal_finite_differences_of_predictions(name: str):
+def test_derivatives_equal_finite_differences_of_predictions(name: KernelName):
     shape, step = fit_half_sphere(half_sphere(), name), 1e-6
     points = queries(shape, 30).reshape(5, 6, 3)
     found = shape.differentiate(points)
@@ -76,7 +77,7 @@ def test_derivatives_equal_finite_differences_of_predictions(name: str):
 
 
 @EVERY_KERNEL
-def test_closed_forms_of_a_kernel_equal_autograd_of_its_profile(name: str):
+def test_closed_forms_of_a_kernel_equal_autograd_of_its_profile(name: KernelName):
     kernel = kernel_by_name(name, 3.6)
     r = real([0.0, 1e-7, 0.01, 0.3, 1.0, 2.4])
     derived = differentiate(kernel.profile, r, 4)
@@ -103,14 +104,14 @@ def test_kernels_are_those_of_scikit_learn_or_of_any_profile_and_unknown_ones_ar
     near(found.distance, wanted.distance, 1e-8)
     near(found.covariance, wanted.covariance, 1e-6)
     with pytest.raises(BadArgument, match="kernel"):
-        fit_half_sphere(known, "cubic")
+        fit_half_sphere(known, "cubic")  # pyright: ignore[reportArgumentType]
     with pytest.raises(BadArgument, match="length"):
         rbf_kernel(0.0)
 
 
 @EVERY_KERNEL
 @pytest.mark.parametrize("with_normals", [True, False])
-def test_updates_equal_a_refit(name: str, with_normals: bool):
+def test_updates_equal_a_refit(name: KernelName, with_normals: bool):
     known = half_sphere(50, extra=6)
     if not with_normals:
         has = torch.arange(len(known.x)) < len(known.x) - 6

@@ -11,7 +11,7 @@ from torchgrasp.base import join
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.conditioning import Criterion, Selection, posterior_given, select_points
-from torchgrasp.shape.kernel import Kernel, kernel_by_name
+from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 from torchgrasp.shape.values import Observations, on_surface
 
 PSI = 3.6
@@ -44,7 +44,7 @@ def _distances(seen: Observations, kernel: Kernel, x: Tensor) -> tuple[Tensor, T
 
 @pytest.mark.parametrize("kernel", ["thin_plate", "matern52"])
 @pytest.mark.parametrize("criterion", ["variance", "error", "both"])
-def test_picks_are_those_of_refitting_every_time(criterion: Criterion, kernel: str):
+def test_picks_are_those_of_refitting_every_time(criterion: Criterion, kernel: KernelName):
     (points, known), chosen = _scene(120), kernel_by_name(kernel, PSI)
     wanted: list[int] = []
     for _ in range(20):
