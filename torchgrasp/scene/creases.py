@@ -59,13 +59,14 @@ def _divide(points: np.ndarray, mask: np.ndarray, reach: float, least: float) ->
         second = -(np.roll(normal, before, (0, 1)) * chord).sum(-1) / length
         ends = np.roll(known, after, (0, 1)) & np.roll(known, before, (0, 1))
         crease |= ends & (np.minimum(first, second) > 0.35) & (length < 4 * REACH)
-    number, count = label(binary_erosion(mask & ~crease, iterations=max(1, step // 3)))
-    large = np.bincount(number.ravel(), minlength=count + 1) >= least
+    number = np.empty(mask.shape, dtype=np.int32)
+    label(binary_erosion(mask & ~crease, iterations=max(1, step // 3)), output=number)
+    large = np.bincount(number.ravel()) >= least
     large[0] = False
-    names = np.where(large, np.cumsum(large), 0)[number]
+    names: np.ndarray = np.where(large, np.cumsum(large), 0)[number]
     if large.sum() < 2:
         return mask[inside].astype(np.int64)
-    nearest = distance_transform_edt(names == 0, return_distances=False, return_indices=True)
+    nearest = np.asarray(distance_transform_edt(names == 0, return_distances=False, return_indices=True))
     return np.where(mask, names[tuple(nearest)], 0)[inside]
 
 

@@ -184,7 +184,7 @@ def _is_noise(labels: Int[Tensor, "h w"], k: int, image: DepthImage, deviations:
     rows, columns = (slice(max(0, int(side.min()) - 4), int(side.max()) + 5) for side in torch.nonzero(mine).T)
     mine, near, points = mine[rows, columns], labels[rows, columns], image.points()[rows, columns]
     pixel = image.depth[labels == k].median() / image.intrinsics[0, 0]
-    if float(distance_transform_edt(mine.numpy()).max()) * float(pixel) > 0.005:
+    if float(np.max(np.asarray(distance_transform_edt(mine.numpy())))) * float(pixel) > 0.005:
         return False
     around = torch.from_numpy(binary_dilation(mine.numpy(), iterations=4)) & (near > 0) & ~mine
     around &= count_labels(labels)[near] > 10 * int(mine.sum())
