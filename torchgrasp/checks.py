@@ -236,7 +236,7 @@ def _has_tensor(hint: Any) -> bool:
 
 @functools.cache
 def _always(kind: type) -> bool:
-    """Return whether a value class is checked even if the library makes the value: its numbers may come from files."""
+    """Return whether values of a class are checked even if the library makes them, because files may give them."""
     return hasattr(kind, "__post_init__") or not any(map(_has_tensor, _fields(kind).values()))
 
 
@@ -280,7 +280,7 @@ class _ByName(type):
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return a finite floating-point tensor of a shape (None: any size); raise `BadArgument` otherwise."""
+    """Return a finite floating-point tensor of a shape, in which None allows any size, or raise `BadArgument`."""
     call = _Call(gradients=True)
     _read_tensor(name, value, Float[Tensor, " ".join("_" if s is None else str(s) for s in shape)], call)
     call.check_numbers()

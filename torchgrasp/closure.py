@@ -156,9 +156,9 @@ class ClosingOptions(Value):
     Args:
         wait: a finger that touches waits for the others; then all press together.
         pose_estimate: early and late touches update the object-pose estimate, which moves all contacts.
-        palm_reach: largest displacement [m] of the palm, which follows the estimated object pose; 0: the palm does not
-            move.
-        stops: how often the approaching hand may stop at an unexpected contact and move sideways; 0: never.
+        palm_reach: largest displacement [m] of the palm, which follows the estimated object pose; 0 means that the palm
+            does not move.
+        stops: how often the approaching hand may stop at an unexpected contact and move sideways; 0 means never.
         attempts: largest number of closings: on a known table the hand closes again if the grasp seems too weak to
             lift.
 

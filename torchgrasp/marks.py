@@ -25,7 +25,7 @@ class Range(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """A mark for a batch in a field: it must have as many rows as tensors with the axis `letter`."""
+    """Annotation of a field that holds a batch, with as many rows as the axis `letter` of the other fields is long."""
 
     letter: str
 
@@ -147,7 +147,7 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
 
 
 def check_path(name: str, path: Path | str) -> None:
-    """Raise `BadArgument` for a path that no file can have: with a NUL, a half character, or too long."""
+    """Raise `BadArgument` for a path that no file can have: it has a NUL or a lone surrogate, or is too long."""
     try:
         raw = os.fsencode(path)
     except UnicodeEncodeError as error:

@@ -31,12 +31,12 @@ class ContactSpec(Value):
         edges: edges of the linearised friction cone, at least 3.
         max_variance: S_thresh of Eq. (12), a variance in normalised units.
         friction_margin: contacts are planned and certified with `friction * friction_margin`.
-        separation: least distance between the centres of two touching fingertips [m]; None: their diameter plus 2 mm.
+        separation: least distance between the centres of two fingertips [m]; by default their diameter plus 2 mm.
             Contacts on opposite sides of a thin object may be closer.
-        flatness: largest angle [rad] between the normals at a contact and on a ring around it; None: not checked.
-        flat_radius: radius [m] of the ring; None: the largest of `FLAT_RADII` that the object allows.
-        table: the table's `Plane` in the cloud's frame, or its height [m] along z; None: no table.
-        tip_radius: radius [m] of the fingertips, which may rest on the table; 0: points. None: the hand's.
+        flatness: largest angle [rad] between the normals at a contact and on a ring around it; None checks nothing.
+        flat_radius: radius [m] of the ring; by default the largest of `FLAT_RADII` that the object allows.
+        table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no table.
+        tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. By default the hand's.
         start_radius: normalised radius of the sphere on which initial guesses are drawn (Sec. 6.2; the paper: 0.1).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
         contact_allowed: whether links may touch and push the target's neighbours; collisions then only lower the
@@ -149,13 +149,13 @@ class TrialSpec(Value):
         holding: how the closed hand presses: "force" (balanced forces), "grip" (least forces for the felt load),
             "impedance" (the grasp is a spring in the hand), "position" (joint targets are kept) or "law" (Eq. 25
             continues). In open loop the squeeze is kept.
-        options: components of the closing "uncertainty" or "fixed"; None: all components.
+        options: components of the closing "uncertainty" or "fixed"; by default all components.
         sensor: sensors of the fingertips; the controller knows their kind.
-        max_force: largest normal force [N] of a fingertip; None: no limit.
+        max_force: largest normal force [N] of a fingertip; None means no limit.
         mass: mass of the object [kg].
         friction: coefficient of friction of every contact.
         gravity: gravity [m/s^2].
-        approach: length [m] of the straight path to the pre-grasp; 0: the hand starts there.
+        approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts there.
         lift_height: height of the lift [m].
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
@@ -166,7 +166,7 @@ class TrialSpec(Value):
         simulator: "sapien" or "mujoco".
         density: density of the object [kg/m^3]; it replaces `mass` unless None.
         patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x force x patch.
-        kp: stiffness of all joint drives [N m/rad]; None: the hand's own.
+        kp: stiffness of all joint drives [N m/rad]; by default the hand's own.
         overlap: largest overlap [m] at the start; convex parts bulge a little.
         table: whether the object stands on a table.
         self_collision: whether links of the hand collide with each other, in the pairs that the hand names.

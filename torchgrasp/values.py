@@ -29,8 +29,8 @@ class PointCloud(Value):
     Args:
         points: surface points [m], at least 4.
         normals: outward normals of any length, or None.
-        viewpoint: position of the camera [m], or of each point's camera; None: unknown.
-        frustum: inward unit normals of the four sides of the camera's field of view, or of each point's; None: unknown.
+        viewpoint: position of the camera [m], or of each point's camera; None if it is unknown.
+        frustum: inward unit normals of the four sides of the camera's view, or of each point's; None if unknown.
             An object that reaches a side is cut off there.
 
     Raises:
@@ -162,9 +162,10 @@ class Certificate(Batch):
     """The proof that contact sets have frictional form closure (Eq. 13), or that they have not; see `certify`.
 
     `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio` is the smallest over the largest
-    singular value of W, torques divided by the radius of the contacts. `residual` is the largest |W phi|. `closed`
-    needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13) too. `witness` is a unit
-    wrench w with w . v >= -margin for every edge wrench v. If the contacts are not closed, no contact force opposes w.
+    singular value of W, torques divided by the radius of the contacts. `residual` is the largest |W phi|. `closed`,
+    which means force closure, needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13)
+    too. `witness` is a unit wrench w with w . v >= -margin for every wrench v along an edge of a friction cone. If the
+    contacts have no force closure, no contact force opposes w.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -216,8 +217,8 @@ class Grasps(Batch):
     direction of its straight path there. `clearance` [m] is the least distance of the links from the estimated
     surface, from each other and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle
     between pad axis and contact direction. `score` is the log-odds of the predicted success, which ranks the grasps.
-    `known` tells where trials support the prediction; None: everywhere. `meta` holds names, units, hashes and the seed
-    as text.
+    `known` tells where trials support the prediction; None means everywhere. `meta` holds names, units, hashes and the
+    seed as text.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")

@@ -39,8 +39,9 @@ def versions() -> dict[str, str]:
 def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str]) -> bytes:
     """Plan and try the grasps of one job; return the bytes of a shard file that holds only this job.
 
-    A machine of a cluster needs the `versions` in `meta`, with which the campaign began, and the same hand. A faulty
-    object gives a row with the reason; errors that are not the object's fault are raised.
+    Every machine must have the same hand and the same software as the machine that began the campaign: `meta` holds the
+    `versions` of the software. A faulty object gives a row with the reason. Errors that are not the object's fault are
+    raised.
     """
     hand, here = view.load_hand(), json.dumps(versions())
     if here != meta["versions"]:

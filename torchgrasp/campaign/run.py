@@ -58,7 +58,7 @@ class CampaignSpec(Value):
 
     @property
     def test(self) -> Protocol:
-        """The test protocol."""
+        """The settings of the trials that test each grasp."""
         return find_protocol(self.protocol)
 
 
@@ -82,9 +82,9 @@ def run_campaign(
         objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every machine.
         hand: from `load_hand`, with the fingers that grasp.
         folder: folder of the data set; no other run may write to it at the same time.
-        spec: options of the campaign; None: `CampaignSpec()`.
-        workers: processes here, 0: this one; or the address of a Dask scheduler, as "tcp://10.0.0.1:8786", whose
-            workers have one thread each.
+        spec: options of the campaign; `CampaignSpec()` by default.
+        workers: number of processes on this machine, where 0 means this process. Or the address of a Dask scheduler,
+            such as "tcp://10.0.0.1:8786", whose workers have one thread each.
         observer: called with the row of each finished job.
 
     Raises:

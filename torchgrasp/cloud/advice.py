@@ -47,7 +47,7 @@ def judge_view(
         cloud: distinct points [m], with the given normals and viewpoint, if any.
         clean: the same cloud cleaned, with outward normals and perhaps an estimated viewpoint.
         up: the vertical, of unit length.
-        table: None: at the lowest point.
+        table: the table; None means one at the lowest point.
         stands: whether the object stands on a table.
     """
     assert clean.normals is not None

@@ -45,7 +45,7 @@ def check_agreement(
 
 
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
-    """Refuse a true mesh that lies elsewhere than the cloud of its object; raises `BadArgument`."""
+    """Raise `BadArgument` for a true mesh that does not lie on the cloud of its object."""
     check_agreement(name, cloud.points, "the cloud's points", mesh, 0.01 + 2 * _noise(cloud), 0.2)
 
 

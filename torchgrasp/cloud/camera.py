@@ -38,7 +38,7 @@ def look_at(
         azimuth: direction of the camera, from x towards y [deg].
         elevation: above the horizontal [deg], in [-89.9, 89.9].
         distance: from the target [m], in [0.01, 10].
-        target: point (3,) [m] in the middle of the image, or a mesh, for the centre of its box; None: the origin.
+        target: point (3,) [m] in the middle of the image, or a mesh, for the centre of its box; by default the origin.
 
     Raises:
         BadArgument: an angle or a distance outside its range.
@@ -78,7 +78,7 @@ def partial_view(
         mesh: in the object frame [m].
         camera_pose: obj_from_camera, see `look_at`.
         n: points drawn from the pixels; all pixels if there are fewer.
-        noise: False: exact depths; or the name of a camera, or its `SensorNoise`.
+        noise: the name of a camera, or its `SensorNoise`; False gives exact depths.
         seed: of noise and choice of points.
 
     Raises:
@@ -154,7 +154,7 @@ def render_depth(
     Args:
         meshes: in the world frame [m].
         camera_pose: world_from_camera, see `look_at`.
-        table: height z of the table [m]; None: no table.
+        table: height z of the table [m]; None means no table.
         noise: as in `partial_view`.
         seed: of the noise.
 

@@ -115,7 +115,7 @@ def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
 
 
 def _guess_unit(extent: float) -> str:
-    """Name the unit of an extent that no object has in metres; objects for a hand are 5 to 45 cm long."""
+    """Guess the unit of an extent that is too large or too small to be in metres: objects are 5 to 45 cm long."""
     if extent < MIN_EXTENT:
         return "normalised"
     if extent < 10:

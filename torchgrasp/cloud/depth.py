@@ -44,10 +44,10 @@ def cloud_from_depth(
         intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], its 9 numbers, a 3 x 4 projection matrix, (fx, fy, cx, cy)
             [pixels], or (fx, fy, cx, cy, width, height) with the size of the image, which may be a crop. Or the dict or
             object of ROS (CameraInfo), Open3D, RealSense, Zivid or BOP, with its depth_scale.
-        mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None: all measured pixels.
-        camera_pose: obj_from_camera (4, 4), rigid; None: the result is in the camera's frame.
-        depth_unit: metres of one count of the depth, such as 0.00025; None: of the intrinsics, or as `depth` says.
-        up: (3,), against gravity in the frame of the pose, to which a table in the image is compared; None: z.
+        mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None means all measured pixels.
+        camera_pose: obj_from_camera (4, 4), rigid; without it the result is in the camera's frame.
+        depth_unit: metres of one count of the depth, such as 0.00025; by default that of the intrinsics or of `depth`.
+        up: (3,), against gravity in the frame of the pose, to which a table in the image is compared; z by default.
 
     Raises:
         BadArgument: depth that is negative or of another unit; intrinsics of another resolution; a mask of another size
@@ -97,7 +97,7 @@ def read_depth(
     mask: Tensor | np.ndarray | None = None,
     depth_unit: Positive | None = None,
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"], Bool[Tensor, "h w"] | None]:
-    """Check the arguments of `cloud_from_depth`; return depth [m] (0: not measured), intrinsics and mask."""
+    """Check the arguments of `cloud_from_depth`; return depth [m] (0 if not measured), intrinsics and mask."""
     k, stated, scale = _read_intrinsics(intrinsics)
     image = _as_tensor("depth", depth)
     if image.ndim == 3 and 1 in (image.shape[0], image.shape[-1]):  # one channel
@@ -224,7 +224,7 @@ def _read_intrinsics(value: object) -> tuple[Float[Tensor, "3 3"], list[float] |
 
 
 def _wrong_numbers(k: Float[Tensor, "3 3"], size: Sequence[int]) -> tuple[str, str] | None:
-    """Return what is wrong with numbers that no camera has, and what is right; None: nothing."""
+    """Return what is wrong with numbers that no camera has, and what would be right; None if nothing is wrong."""
     height, width = size
     (fx, _, cx), (_, fy, cy) = k[:2].tolist()
     if min(fx / width, fy / height) < 0.15:
@@ -245,7 +245,7 @@ def _wrong_numbers(k: Float[Tensor, "3 3"], size: Sequence[int]) -> tuple[str, s
 
 
 def _wrong_size(k: Float[Tensor, "3 3"], stated: list[float] | None, size: Sequence[int]) -> tuple[str, str] | None:
-    """Return of which other resolution intrinsics are, and what is right; None: of the image, or of a crop.
+    """Return the other resolution that intrinsics belong to, and what would be right; None if they fit image or crop.
 
     Without a stated size, the double principal point is compared with multiples of the image and with cameras' modes.
     """

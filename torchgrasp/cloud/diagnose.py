@@ -56,8 +56,8 @@ def diagnose_cloud(
 
     Args:
         cloud: points of one object [m].
-        up: the vertical, of any length; None: z is assumed, unless the cloud looks like one in its camera's frame.
-        table: None: at the lowest point.
+        up: the vertical, of any length; by default z, unless the cloud looks like one in its camera's frame.
+        table: the table; None means one at the lowest point.
         stands: whether the object stands on a table; else the camera may be below it.
 
     Raises:

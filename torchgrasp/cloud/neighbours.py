@@ -18,7 +18,7 @@ def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
 def nearest(
     points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
-    """Return distances and indices of the k points nearest to some points (None: to all), itself first.
+    """Return distances and indices of the k points nearest to each of `rows`, by default of all points, itself first.
 
     A small cloud has fewer neighbours.
     """
@@ -31,7 +31,7 @@ def nearest(
 
 
 def find_inliers(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
-    """Mark the points, by default of all, that are no outliers; see `remove_outliers`."""
+    """Return a mask of the given points (by default all points) that are not outliers; see `remove_outliers`."""
     spacing = nearest(points, 9, rows)[0][:, 1:].mean(-1)  # to eight: more than fly off a rim together
     return spacing <= 2.5 * spacing.median()  # the spacing of real views varies less, with depth and slope
 

@@ -62,7 +62,7 @@ def cut_object(
     Args:
         cloud: points [m] of a scene.
         up: the vertical, of unit length.
-        point: on or near the object [m]; points farther than 0.5 m from it are left out. None: the largest object.
+        point: on or near the object [m]; points farther than 0.5 m from it are left out. None means the largest object.
         box: two corners [m]; points outside are left out first.
         gap: least distance [m] between objects.
 

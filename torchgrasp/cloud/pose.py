@@ -129,9 +129,9 @@ def _check_supports(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], u
 
 
 def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up: object) -> None:
-    """Refuse a pose that turns the table over, or one that another convention would make upright.
+    """Refuse a pose by which the table is upside down, or is tilted but would be level by another pose convention.
 
-    A table up to 15 degrees from level may be one of a tilted frame, unless another convention makes it level.
+    Other tilts are accepted, because the frame itself may be tilted.
     """
     sky = torch.tensor([0.0, 0.0, 1.0]).double() if up is None else unit(torch.as_tensor(up).double().cpu())
     normals = torch.stack([support.plane.normal.double() for support in supports])

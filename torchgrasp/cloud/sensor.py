@@ -69,7 +69,7 @@ SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType({
 
 
 def find_sensor(noise: bool | SensorName | SensorNoise) -> SensorNoise | None:
-    """Return the noise of a camera by name; True: an active stereo camera, False: None."""
+    """Return the noise of a camera. True means the noise of an active stereo camera; False gives None: no noise."""
     if isinstance(noise, bool):
         return ACTIVE_STEREO if noise else None
     return SENSORS[noise] if isinstance(noise, str) else noise
@@ -135,7 +135,7 @@ def estimate_noise(
         on_table: pixels that may show the table; those more than 20 mm away from it do not count.
 
     Returns:
-        The noise of depths; None: fewer than 1000 pixels show the table.
+        The noise of depths, or None if fewer than 1000 pixels show the table.
     """
     from scipy.ndimage import uniform_filter
 

@@ -49,10 +49,10 @@ def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str
 
 
 def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
-    """Return the first rows of a table separated by white space, with little more memory than the numbers need.
+    """Return the first `rows` rows of a table separated by white space. Little memory beyond the numbers is used.
 
     Raises:
-        ValueError: too many rows or columns; too few numbers; a word that is no number.
+        ValueError: `rows` or `columns` is above its limit, the data has fewer numbers, or a word is not a number.
     """
     if not (0 <= rows <= CLOUD_POINTS and 1 <= columns <= TEXT_COLUMNS):
         raise ValueError(f"{rows} points of {columns} numbers, not up to {CLOUD_POINTS} of {TEXT_COLUMNS}")

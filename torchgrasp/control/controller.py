@@ -45,7 +45,7 @@ class GraspController:
     Args:
         reference: the closing plan.
         closing, holding, options: as in `TrialSpec`.
-        approach: remaining length [m] of the approach; 0: the hand is at its pre-grasp.
+        approach: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
 
     Raises:
         BadArgument: unknown names; options or the holding "law" for a closing that has none; "impedance" for more than
@@ -208,7 +208,7 @@ def make_closing(reference: ClosingReference, mode: ClosingMode, options: Closin
 def choose_holding(
     hand: Hand, mode: HoldingMode
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
-    """Return the constructor of the hold controller of a mode; None: the closing controller itself presses."""
+    """Return the constructor of the hold controller of a mode, or None if the closing controller itself presses."""
     if mode == "impedance":
         hand.require_three("holding", "'impedance', whose virtual frame is of three,")
         return functools.partial(Impedance, stability=load_stability(hand))

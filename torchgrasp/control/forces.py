@@ -56,7 +56,7 @@ def squeeze(
         hand: the hand; it follows the grasps to their device.
         grasps: g grasps, planned for this hand.
         force: normal force of the strongest finger [N].
-        kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
+        kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
 
     Raises:
         BadArgument: joints or fingers of another hand, or a force or stiffness that is not positive.

@@ -33,7 +33,7 @@ def force_covariance(
 ) -> Float[Tensor, "*b 3 3"]:
     """Return Sigma_fd of Eq. (28) [N^2]: the variance of the normal force along the normal, plus an isotropic floor.
 
-    `deviation` [N] is the standard deviation of each normal force; None: a tenth of the force.
+    `deviation` [N] is the standard deviation of each normal force; by default a tenth of the force.
     """
     std = 0.1 * (forces * normals).sum(-1) if deviation is None else deviation
     return _normal_covariance(normals, std, FORCE_FLOOR)

@@ -25,7 +25,7 @@ class ContactPlanes:
 
     A fingertip that touches measures the offset of its plane, with the variance of the shape (Sigma_cov). A fingertip
     that is beyond its plane without a touch bounds the offset. The estimate maximises the posterior density under a
-    Gaussian prior with the mean `expected` [m, rad] (None: zero), in the frame of the hand at its planned pose.
+    Gaussian prior with the mean `expected` [m, rad] (by default 0), in the frame of the hand at its planned pose.
     """
 
     def __init__(self, reference: ClosingReference, expected: Float[Tensor, "6"] | None = None) -> None:

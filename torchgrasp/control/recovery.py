@@ -138,8 +138,8 @@ class GraspCheck:
 class Reopening:
     """Open the hand and move its palm to the displaced object; `done` says when the hand may close again.
 
-    The object has a `displacement` [m, rad], the hand the joint targets `joints` [rad]. The `palm` [m] moves to at most
-    `reach` [m]; 0: not at all.
+    The object has a `displacement` [m, rad], the hand the joint targets `joints` [rad]. The displacement `palm` [m]
+    changes to at most `reach` [m], and not at all if that is 0.
     """
 
     def __init__(

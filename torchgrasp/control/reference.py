@@ -40,12 +40,12 @@ class ClosingReference(Value):
         squeeze: joint targets that press without feedback, from `squeeze`.
         normals: outward normals of the planned contacts.
         gains: contacts, gains and desired forces (Eqs. 26-28).
-        approach: unit vector along which the opened hand moves to its pre-grasp; None: no approach.
-        table: the table, which no fingertip enters while it searches; None: unknown.
+        approach: unit vector along which the opened hand moves to its pre-grasp; None means no approach.
+        table: the table, which no fingertip enters while it searches, or None if it is unknown.
         surface: estimated surface of the object in the frame of the grasp (`surface_field`), which locates the object
-            from touches; None: the tangent planes of the contacts are used.
+            from touches. Without it, the tangent planes of the contacts are used.
         sensor: sensors of the fingertips.
-        max_force: largest normal force [N] of a fingertip; None: no limit.
+        max_force: largest normal force [N] of a fingertip; None means no limit.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -84,9 +84,9 @@ class ClosingReference(Value):
             hand: the hand.
             grasp: a single grasp, planned for the hand.
             force: normal force of the strongest finger [N].
-            kp: stiffness of every joint's drive [N m/rad]; None: the hand's own.
+            kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
             stability: model that chooses among balanced forces of nearly equal friction, and gives their covariance;
-                None: the covariance grows with the force.
+                without it the covariance grows with the force.
 
         Raises:
             BadArgument: not exactly one grasp, joints or fingers of another hand, a force or stiffness that is not
@@ -183,7 +183,7 @@ def next_target(
 
 
 def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:
-    """Return the unit approach direction of one grasp in the hand's frame; None: no approach."""
+    """Return the unit approach direction of one grasp in the hand's frame, or None if there is none."""
     direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
     return unit(direction) if bool((direction != 0.0).any()) else None
 

@@ -125,7 +125,7 @@ class FingertipSensor:
 
     Args:
         reference: the closing plan, with the sensor model.
-        generator: draws the noise; None: no noise.
+        generator: draws the noise; without one there is no noise.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -179,5 +179,5 @@ class FingertipSensor:
         return torques
 
     def _silence(self, felt: Tensor, nothing: Tensor) -> Tensor:
-        """Return a quantity that all fingertips felt, with `nothing` for the dead."""
+        """Return a measured quantity, replaced by `nothing` at fingertips whose sensor is dead."""
         return torch.where(self.alive if felt.ndim == 1 else self.alive[:, None], felt, nothing)

@@ -29,7 +29,7 @@ class TipContact(Value):
     """True contacts of f fingertips, averaged over a tick.
 
     `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN without contact.
-    `sliding` [m/s] is the speed of the tip along the surface; None: no tip slides.
+    `sliding` [m/s] is the speed of the tip along the surface; None means that no tip slides.
     """
 
     normal_force: Float[Tensor, "*b f"]
@@ -95,9 +95,9 @@ def measure(
         tactile: the state at the last tick.
         truth: true contacts during the tick.
         pads: outward surface normals at the planned contacts, for the noise of tips that touch nothing.
-        radius: radius of the tips [m]; 0: not round, 12 mm is assumed.
+        radius: radius of the tips [m]; 0 means that they are not round, and 12 mm is assumed.
         period: period of the tick [s].
-        generator: draws the noise; None: no noise.
+        generator: draws the noise; without one there is no noise.
         noise: factor on the standard deviation of the noise.
 
     Raises:
@@ -152,7 +152,7 @@ class Targets(NamedTuple):
     Args:
         joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
         palm: displacement of the palm [m] from its planned path, in the hand's axes; the palm does not rotate.
-        left: remaining length [m] of the approach; 0: the hand is at its pre-grasp.
+        left: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
     """
 
     joints: Float[Tensor, " j"]

@@ -168,7 +168,7 @@ def _check_name(field: Field, name: str) -> None:
 def list_views(
     objects: Path | str, whole: bool = False, only: Sequence[str] = (), most: Count | None = None
 ) -> list[tuple[str, str]]:
-    """Return sorted pairs of object and view, at most `most` views of each object; None: all.
+    """Return sorted pairs of object and view, at most `most` views of each object, by default all.
 
     `only` selects objects; with `whole` each object has the single view `WHOLE`.
 

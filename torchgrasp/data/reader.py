@@ -23,7 +23,7 @@ CARD = "card.json"  # file that describes a data set; it is written last, so a f
 
 
 class ShardJob(NamedTuple):
-    """One job of a data set: its row, the cloud (None: no view was read) and the grasps that were tried.
+    """One job of a data set: its row, the cloud (None if no view was read) and the grasps that were tried.
 
     `passed` and `outcome` (a `Status`) have a row for each grasp, and a column for each simulated trial.
     """
@@ -42,14 +42,15 @@ class GraspShards:
     `len` counts the grasps. Item i is a dict of float32 tensors [m, rad] in the object's frame: `points` (n, 3) and
     `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach` (3,), `obj_from_hand` (4, 4); `contacts` and
     `normals` (f, 3), `std_m` (f,); `margin` and `witness` (6,) of the certificate; `clearance`; `predicted` success;
-    `simulated`, the fraction of simulated trials that passed. `closed` is a bool, `job` the index in `jobs`.
+    `simulated`, the fraction of simulated trials that passed. `closed` (a bool) tells whether the grasp has force
+    closure, `job` is the index in `jobs`.
 
     Args:
         folder: folder of the data set.
         card: content of `card.json`.
         jobs: a row for each object and view, with or without grasps.
         size: number of jobs in a shard.
-        points: number of points of each item's cloud; None: all points, so clouds may differ in size.
+        points: number of points of each item's cloud; None means all points, so that clouds may differ in size.
     """
 
     folder: Path
@@ -129,7 +130,7 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     Args:
         folder: folder of the data set.
         points: number of points that are drawn from each cloud, equal in every call; a smaller cloud repeats points.
-            None: all points.
+            None means all points.
 
     Raises:
         ModelFileError: the campaign is not finished, or its card is damaged.
@@ -164,7 +165,7 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
 
 
 def _choose(points: Tensor, count: int | None, seed: int) -> Tensor:
-    """Draw `count` points of a cloud; None: all points."""
+    """Draw `count` points of a cloud; None means all points."""
     if count is None:
         return points
     generator = torch.Generator().manual_seed(seed)

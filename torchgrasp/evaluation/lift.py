@@ -65,14 +65,14 @@ def close_hand(
         grasp: a single grasp.
         hand: the hand of the grasp.
         mesh: the true object [m], closed, in the frame of the grasp: a trimesh or a file.
-        spec: parameters of the trial; None: `TrialSpec()`.
+        spec: parameters of the trial; `TrialSpec()` by default.
         seed: random seed of the tactile sensors' noise.
-        error: true pose of the hand in its planned frame, unknown to the controller; None: the planned pose.
-        parts: convex parts of the mesh; None: they are computed (`convex_parts`).
-        table: the table below the object, in the frame of the grasp; None: horizontal, at the mesh's lowest point.
+        error: true pose of the hand in its planned frame, unknown to the controller; by default the planned pose.
+        parts: convex parts of the mesh; by default they are computed (`convex_parts`).
+        table: the table below the object, in the grasp's frame; by default horizontal, at the mesh's lowest point.
         neighbours: other bodies on the table, which the hand may push.
-        surface: estimated surface of the object (`surface_field`), to estimate the object's pose from touches; None:
-            only the tangent planes of the planned contacts are used.
+        surface: estimated surface of the object (`surface_field`), to estimate the object's pose from touches. Without
+            it, only the tangent planes of the planned contacts are used.
 
     Raises:
         BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint limits; an approach

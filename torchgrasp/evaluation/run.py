@@ -40,9 +40,9 @@ def evaluate(
         objects: a folder as in `torchgrasp.data`.
         hand: the hand that grasps.
         protocol: a protocol or its name in `PROTOCOLS`.
-        spec: views and grasps; None: `EvaluationSpec()`.
-        folder: folder for the executable grasps of each view, OBJECT/VIEW.safetensors; None: a temporary folder. No
-            other run may write to it at the same time.
+        spec: views and grasps; `EvaluationSpec()` by default.
+        folder: folder for the executable grasps of each view, OBJECT/VIEW.safetensors; by default a temporary folder.
+            No other run may write to it at the same time.
         workers: number of worker processes; the scores do not depend on it.
 
     Raises:

@@ -32,7 +32,7 @@ STAGES: dict[str, tuple[Status, ...]] = {
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of one trial of the grasp at `rank`, with the pose error of number `draw`; NaN: not measured.
+    """The outcome of one trial of the grasp at `rank`, with the pose error of number `draw`; NaN if not measured.
 
     Args:
         moved: motion of the object [m]; in a lift relative to the hand.

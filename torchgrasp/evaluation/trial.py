@@ -188,7 +188,7 @@ class TrialRun:
 
     @property
     def felt(self) -> tuple[float, float]:
-        """The controller's estimates of friction and load [N]; NaN without the holding "grip"."""
+        """The controller's estimates of friction and load [N]; NaN unless it holds the object in the mode "grip"."""
         hold = self.controller.hold
         return (hold.friction.mean, hold.weight) if isinstance(hold, GripHold) else (math.nan, math.nan)
 

@@ -50,8 +50,8 @@ class EvaluationSpec(Value):
         only: names of objects; (): all objects.
         planned: use the grasps that an earlier call saved, instead of planning.
         seed: random seed.
-        views: largest number of views of each object; None: all views.
-        fingers: as in `plan_grasps`; None: the hand's own fingers.
+        views: largest number of views of each object; None means all views.
+        fingers: as in `plan_grasps`; by default the hand's own fingers.
 
     Raises:
         BadArgument: no grasps, or unknown ranks.

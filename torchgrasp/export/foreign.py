@@ -174,15 +174,15 @@ def grasps_from_joints(
     """Return imported joints and poses as `Grasps`, for `certify`, `close_hand`, `evaluate` and the exporters.
 
     Contacts are at the middle of each pad, with normals opposite to the pads'. Certificates are for these contacts; a
-    grasp that is not closed gets `Status.NOT_CLOSED`. Replace contacts and certificate if you know the surface.
-    `clearance` is that of self-collision, because no object is known. `score` is 0: nothing is predicted. The approach
-    is the hand's own approach axis.
+    grasp without force closure gets `Status.NOT_CLOSED`. Replace contacts and certificate if you know the surface.
+    `clearance` is that of self-collision, because no object is known. `score` is 0, because nothing is predicted. The
+    approach is the hand's own approach axis.
 
     Args:
         hand: the grasping hand.
         joints: actuated joints [rad], in the order of `hand.joint_names`.
         obj_from_hand: poses of the root link of the hand's URDF.
-        pregrasp: joints of the opened hand; None: each tip is moved 20 mm off its contact, or as far as limits allow.
+        pregrasp: joints of the opened hand; by default each tip moves 20 mm off its contact, or as far as limits allow.
         spec: friction and edges of the certificate; `ContactSpec()` by default.
         std_m: standard deviation [m] of the surface at each contact, for closing controllers that use it.
 

@@ -45,7 +45,7 @@ def format_moveit(
     pre-grasp posture has positions; the grasp posture closes to the contacts, then to targets that press, with the
     torques [N m] as effort. `grasp_quality` is the predicted success. The retreat is opposite to the approach. `force`
     [N] is the normal force of the strongest finger. `kp` is the stiffness of the robot's own position control [N
-    m/rad]; None: the hand's.
+    m/rad], by default the hand's.
 
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.

@@ -83,7 +83,7 @@ def farthest_points(
         count: the number of points.
         first: index of the first point.
         tie: relative difference up to which distances count as equal; of equally far points the first is taken.
-        distance: function that returns the distance of each point from a single point; None: the Euclidean distance.
+        distance: function that returns the distance of each point from a single point; Euclidean by default.
         before: points that count as already picked and are not returned; `first` is then not used.
     """
     every = points.detach().cpu()

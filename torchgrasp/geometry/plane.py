@@ -79,7 +79,7 @@ class Plane(Value):
 
 
 def as_plane(table: Plane | float | None) -> Plane | None:
-    """Return a table as a plane: from a plane, a height [m] along z, or None."""
+    """Return a table as a plane. It is given as a plane or as its height [m] along z; None means no table."""
     if table is None or isinstance(table, Plane):
         return table
     if isinstance(table, bool) or not isinstance(table, int | float) or not math.isfinite(table):

@@ -30,7 +30,7 @@ class Support:
 
     Args:
         plane: the plane; the camera is above it.
-        sides: outward unit vector and offset [m] of each vertical side of the region; None: an unbounded region.
+        sides: outward unit vector and offset [m] of each vertical side of the region; None if it is unbounded.
         width: smaller width of the region [m].
     """
 
@@ -101,8 +101,8 @@ def find_supports(
 
     Args:
         points: everything that was seen [m].
-        viewpoint: the camera's position [m], on the upper side; None: the side with more points is the upper one.
-        up: against gravity, of any length; None: any direction.
+        viewpoint: the camera's position [m], on the upper side. If it is None, the side with more points is upper.
+        up: vector against gravity, of any length; None allows any direction.
         seed: of the draws.
         least_width: of the region of a support [m].
 
@@ -136,10 +136,10 @@ def find_supports(
 def bound(
     plane: Plane, points: Float[Tensor, "n 3"], on: Bool[Tensor, "n"], eye: Float[Tensor, "3"] | None
 ) -> Support | None:
-    """Return the support on a plane, bounded by the connected points on it; None: too few points.
+    """Return the support on a plane, bounded by the connected points on it, or None if there are too few points.
 
-    The region is the convex hull of the largest part. Another large part joins it if the camera sees nothing through
-    the hull of both: an object hides what lies between.
+    The region is the convex hull of the largest part. Another large part joins it if the camera sees almost nothing
+    below the plane in the area between them: then an object hides that area.
     """
     if int(on.sum()) < 3:
         return None
@@ -173,7 +173,7 @@ class Hull:
 
     @classmethod
     def of(cls, points: Float[Tensor, "n 2"]) -> "Hull":
-        """Return the convex hull of points in a plane; one that holds nothing, if all points are on a line."""
+        """Return the convex hull of points in a plane. If all points lie on a line, no point is inside the hull."""
         from scipy.spatial import ConvexHull, QhullError
 
         try:

@@ -48,7 +48,10 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
-        """Return the positions of all movable joints of the URDF, without a check, which would wait for a GPU."""
+        """Return the positions of all movable joints of the URDF, computed from those of the actuated joints.
+
+        The input is not checked, because a check would wait for the GPU.
+        """
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
     @checked(gradients=True)
@@ -70,7 +73,7 @@ class ActuatedJoints(Value):
         self._refuse(name, joints, (joints < low) | (joints > high), None)
 
     def _refuse(self, name: str, joints: Tensor, wrong: Tensor, allowed: str | None) -> None:
-        """Raise `BadArgument` for the first joint marked as `wrong`; `allowed` None: the joint's range."""
+        """Raise `BadArgument` for the first joint marked as `wrong`. It names `allowed`, or else the joint's range."""
         if bool(wrong.any()):
             *batch, k = torch.nonzero(wrong)[0].tolist()
             limits = f"a number in [{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"

@@ -197,7 +197,7 @@ class Hand(Value):
     ) -> Float[Tensor, "*b f 3 h"]:
         """Return the Jacobian [m/rad] of the fingertips' contact points by the actuated joints.
 
-        `at` are points [m] fixed to the fingertips, such as where round tips touch; None: the pads' contact points.
+        `at` are points [m] fixed to the fingertips, such as where round tips touch; by default the contact points.
         """
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))

@@ -106,7 +106,7 @@ class FreeMotion(Value):
 
     The q motions are three translations along the root's axes, three rotations about them, and the joints that the
     actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling` maps a step of pose (six numbers) and
-    actuated joints to the motions; None: the identity.
+    actuated joints to the motions; None means the identity.
 
     `product` maps all link frames to all markers in one matrix product, in groups of `sizes`. The markers are the given
     ones, then each motion's origin, rotation axis and translation axis; one of the two axes is zero.
@@ -219,7 +219,7 @@ def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
 
 
 def _tables(joint: Joint | None) -> Float[Tensor, "4 3 4"]:
-    """Return the four tables of a joint's pose in its parent; None: those of the root."""
+    """Return the four tables of a joint's pose in its parent; None gives those of the root."""
     tables = torch.zeros(4, 3, 4, dtype=torch.float64)
     constant, sine, cosine, slide = tables
     if joint is None:

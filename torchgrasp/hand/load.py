@@ -105,7 +105,7 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
 
     Args:
         grasps: grasps of `plan_grasps`, also loaded from a file.
-        hand: the same hand with any fingers, its name or its folder; None: the shipped hand that the grasps name.
+        hand: the same hand with any fingers, its name or its folder; by default the shipped hand that the grasps name.
 
     Raises:
         BadArgument: grasps that name no hand, another hand, or fingers that the hand does not have.

@@ -46,7 +46,7 @@ NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
     "limit": {"lower": (1, ""), "upper": (1, ""), "effort": (1, "0"), "velocity": (1, "0")},
     "mimic": {"multiplier": (1, "1"), "offset": (1, "0")},
 }
-"""Attributes that are numbers: their count and default. None: required; "": omitted."""
+"""Attributes that are numbers: their count and default. None marks a required one, "" one that may be omitted."""
 
 
 class _BoundedBuilder(ET.TreeBuilder):

@@ -114,7 +114,10 @@ class SelfCollision(Value):
     def _near(
         self, frames: Float[Tensor, "3 4 l n"], below: float
     ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"]]:
-        """Return the placed shapes, the separations of bounding spheres, and the pairs and postures below `below`."""
+        """Return the placed shapes, the separations of the bounding spheres of each pair, and two indices.
+
+        They are the pair and the posture of each separation that is less than `below`.
+        """
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding, distance)

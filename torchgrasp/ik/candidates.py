@@ -36,7 +36,7 @@ class GraspProblem(Value):
     """The input of a grasp solver: a hand, certified contact sets and the collision world.
 
     Grasps around `center`, the object's centre [m], score higher. `reachable` says which hand poses an arm can reach;
-    None: every pose.
+    None means every pose.
 
     Raises:
         BadArgument: contacts without `std_m`, by which the pre-grasp opens.

@@ -48,7 +48,7 @@ class Obstacles(Value):
     @classmethod
     @checked
     def of(cls, occupancy: Occupancy, full: float = 0.3, hard: bool = True) -> "Obstacles | None":
-        """Return the obstacles of an occupancy grid: voxels of probability `full` or more are occupied. None: all free.
+        """Return the voxels of a grid with probability `full` or more as obstacles, or None if there are none.
 
         Raises:
             BadArgument: `full` outside [0.01, 1].

@@ -79,7 +79,7 @@ class JointProblem:
         return ContactProblem.of(self.shape, self.spec)
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
-        """Return all residuals [mm], and their Jacobian by all unknowns."""
+        """Return all residuals [mm] and their Jacobian with respect to hand pose, joints, contacts and tensions."""
         hand, shape = self.hand, self.shape
         mean, slope = triple_mean_jet(shape, state.points), state.variance_gradient
         jet = SurfaceJet(**vars(mean), variance=state.variance, variance_gradient=slope)
@@ -169,10 +169,10 @@ def solve_sliding(
 
 @checked
 def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
-    """Return a checked grasp for each contact set with seeds, best first; contacts slide if the hand misses them.
+    """Optimise a hand posture for each contact set that has seeds; return the checked grasps, best first.
 
-    Seeds are tried in their order. Contacts that have slid are certified anew; if they fail, the grasp has the `Status`
-    of the contact planner.
+    Seeds are tried in their order. If the hand cannot reach the contacts, they slide along the surface and are
+    certified anew. If they fail, the grasp has the `Status` of the contact planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures

@@ -85,7 +85,10 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the frame of three to five points: axes of their triangle's `virtual_frame`, origin at their centroid."""
+    """Return the frame of three to five points, with the origin at their centroid.
+
+    Its axes are those of the `virtual_frame` of three points: the points themselves, or their `triangle_of`.
+    """
     return rigid(virtual_frame(triangle_of(points))[..., :3, :3], points.mean(-2))
 
 

@@ -71,11 +71,11 @@ def solve_ik(
 
     Args:
         contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not used.
-        mixture: the hand's learned model; None: only the library gives seeds.
-        world: what the links must not touch; None: only self-collision counts. All arguments are moved to the contacts'
+        mixture: the hand's learned model; without it only the library gives seeds.
+        world: what the links must not touch; by default only each other. All arguments are moved to the contacts'
             device.
         method: "cobyla" is the paper's method (Sec. 6.3): tips touch with their contact points, in any direction.
-        library: the hand's random postures; None: drawn when they are needed.
+        library: the hand's random postures; by default they are drawn when they are needed.
 
     Returns:
         The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of its contact and

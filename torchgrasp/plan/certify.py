@@ -32,11 +32,12 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Prove in float64 whether contact sets have frictional form closure, Eq. (13).
 
     The margin is max s: W phi = 0, sum phi = 1, phi >= s; -inf if no phi balances. The friction cones have `spec.edges`
-    edges at friction `spec.planned_friction`. A closed set has a margin of at least 1e-6 and wrenches of full rank.
+    edges at friction `spec.planned_friction`. A `closed` set, one with force closure, has a margin of at least 1e-6 and
+    wrenches of full rank.
 
-    The witness v of a set that is not closed satisfies v.w >= 0 for every edge wrench w, up to rounding; for a margin
-    between 0 and 1e-6 v.w >= -margin. If only the rank is too low, the wrenches are smallest along v. Contacts that are
-    not finite are not closed and give NaN.
+    The `witness` v of another set is a wrench that no contact force opposes: v.w >= 0 for every edge wrench w, up to
+    rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only the rank is too low, the wrenches are smallest
+    along v. Contacts that are not finite are not closed and give NaN.
 
     Args:
         contacts: sets of three to five contacts with outward unit normals, from any planner.

@@ -102,7 +102,8 @@ def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
 def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
     """Return the coefficients phi of the greatest margin of each grasp, and the unit witness of that margin.
 
-    Rounding or too few pivots may spoil both: check them. If nothing balances, the witness proves it, and phi is void.
+    The witness is a wrench that proves that no margin is greater. If no coefficients balance the wrenches, it proves
+    that instead, and phi has no meaning. Rounding or too few pivots may spoil both: check them.
     """
     return in_chunks(_solve, wrench, GRASPS_PER_CHUNK)  # pyright: ignore[reportReturnType]
 
@@ -177,7 +178,7 @@ def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[T
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
-    """Return which sets of three contacts are closed: balanced forces lie in their plane.
+    """Return which sets of three contacts have force closure: balanced forces lie in the plane of the contacts.
 
     Each cone cuts an angle from the plane. The six planar wrenches along the sides of these angles must positively span
     the planar wrenches: no plane through two of them has the others on one side.
@@ -205,7 +206,10 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
 
 
 def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: Guess) -> Bool[Tensor, "b"]:
-    """Return which sets of four or five contacts are closed: cones get more edges until each verdict is proven."""
+    """Return which sets of four or five contacts have force closure.
+
+    The cones get more edges until each verdict is proven.
+    """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches
         return closed
@@ -243,7 +247,10 @@ def _corrected(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Flo
 def most_opposing(
     points: Vectors, normals: Vectors, friction: float, witness: Float[Tensor, "b 6"]
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 6"]]:
-    """Return for each contact the least product of a wrench in its round cone with the witness, and this wrench."""
+    """Return the wrench in each contact's round friction cone that is most opposed to the witness, and their product.
+
+    A witness is a wrench that disproves force closure: its products with all contact wrenches are at least 0.
+    """
     centre, radius = centre_and_radius(points)
     arm = (points - centre) / radius
     force, torque = witness[:, None].expand(-1, points.shape[1], -1).split(3, -1)

@@ -161,7 +161,7 @@ def first_contact(lines: LinePosterior, drawn: Float[Tensor, "b n z"]) -> tuple[
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The `probability` that each contact set is closed on the true surface, with its `standard_error`.
+    """The `probability` that each contact set has force closure on the true surface, with its `standard_error`.
 
     >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
     tensor([0.9700])
@@ -187,10 +187,10 @@ def closure_probability(
     Args:
         shape: the uncertain shape.
         contacts: sets of 3 to 5 contacts [m] with outward unit normals, inside the domain of the shape. A draw in which
-            a finger meets no surface within 12 standard deviations is not closed.
+            a finger meets no surface within 12 standard deviations counts as one without force closure.
         spec: gives the friction of execution, `friction`; `planned_friction` is not used.
         n: number of draws. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is that of (k + 1) / (n +
-            2) for k closed draws, and so never 0.
+            2) for k draws with force closure, and so never 0.
         seed: random seed.
 
     Raises:
@@ -209,7 +209,7 @@ def closure_probability(
 
 
 def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the fraction of n drawn surfaces on which each contact set is closed; 0 at the edge of the domain."""
+    """Return the fraction of n drawn surfaces on which each contact set has force closure; 0 at the domain's edge."""
     inside = well_inside(shape, contacts)
     share = contacts.points.new_zeros(len(contacts))
     share[inside] = closed_share(line_posterior(shape, contacts[inside]), friction, n, seed).to(share)
@@ -217,7 +217,7 @@ def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
 
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the fraction of n drawn surfaces on which each contact set is closed."""
+    """Return the fraction of n drawn surfaces on which each contact set has force closure."""
     draws_per_chunk = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
     gpu_draws = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
     generator = torch.Generator().manual_seed(seed)

@@ -74,14 +74,15 @@ def least_friction_forces(
 ) -> Float[Tensor, "*b f 3"]:
     """Return balanced fingertip forces on the object [N] that need the least friction.
 
-    Forces of three contacts lie in the friction cones whenever any balanced forces do, up to a small weight for even
-    forces. Forces of four or five contacts may need slightly more friction than the least.
+    Forces of three contacts lie in the friction cones whenever any balanced forces do, except for a small error: the
+    search also slightly favours even forces. Forces of four or five contacts may need slightly more friction than the
+    least.
 
     Args:
         points: contacts [m].
         normals: outward unit normals of the object.
         strongest: normal force of the strongest finger [N].
-        preferred: preferred ratios of the normal forces, among forces of similar friction; None: equal.
+        preferred: ratios of the normal forces to prefer among forces of similar friction; by default they are equal.
 
     Returns:
         Forces; NaN rows where no balanced forces push at all contacts.
@@ -150,8 +151,8 @@ def _search_steps() -> tuple[Float[Tensor, "3 s"], ...]:
 def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "b f"], slack: float) -> Vectors:
     """Return balanced forces that need nearly the least friction, near the preferred normal forces.
 
-    More `slack`, the tangent of the cones beyond the ratio needed, gives forces nearer to the preferred ones. A row is
-    NaN where no balanced forces push at every contact within `MAX_FRICTION`.
+    `slack` is added to the friction coefficient that the forces need: a larger one gives forces nearer to the preferred
+    ones. A row is NaN where no balanced forces push at every contact within `MAX_FRICTION`.
     """
     basis = _null_space(points)  # (b, f, 3, k)
     push = -(normals[..., None] * basis).sum(2)  # (b, f, k): a = push z

@@ -109,8 +109,8 @@ def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Float[Tensor, "b p
 class Constraints(Batch):
     """Values of all constraints, and their Jacobians by the u unknowns: coordinates, then tensions.
 
-    `bounds` holds f friction cones, f variances, f domain limits, p distances between contacts and, with a table, f
-    heights.
+    `centre` is the centroid of the f contacts, and `surface` their signed distances from the surface. `bounds` holds f
+    friction cones, f variances, f domain limits, p distances between contacts and, with a table, f heights.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -122,7 +122,7 @@ class Constraints(Batch):
 
     @property
     def values(self) -> Float[Tensor, "b r"]:
-        """All values: centre, surface and bounds, concatenated."""
+        """The values of all constraints in one vector: `centre`, `surface` and `bounds`."""
         return torch.cat([self.centre, self.surface, self.bounds], 1)
 
     @property
@@ -143,10 +143,10 @@ Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]  # values that shou
 
 @dataclasses.dataclass(frozen=True)
 class ContactProblem:
-    """The contact planning problem, Eqs. (10)-(14), in the normalised units of one shape.
+    """The contact planning problem, Eqs. (10)-(14) of the paper, in the normalised units of one shape.
 
-    `friction` is the coefficient of the round cone inside the linearised cone. `separation` is the least distance of
-    two fingertip centres.
+    `friction` is the coefficient of the largest round cone inside the friction cone with flat sides that `certify`
+    uses. `separation` is the least distance of two fingertip centres.
     """
 
     fingertips: int

@@ -47,7 +47,7 @@ def plan_contacts(
         spec: the constraints on contacts; `ContactSpec()` by default.
         starts: number of random initial guesses (Sec. 6.2), or the initial contact points [m].
         seed: random seed.
-        time_budget: wall time [s] of the call; at least 25 starts are planned. None: all starts are planned.
+        time_budget: wall time [s] of the call; at least 25 starts are planned. None plans all starts.
 
     Raises:
         BadArgument: `starts` not positive, of a wrong shape, or outside the shape's domain, or another wrong argument.

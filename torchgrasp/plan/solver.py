@@ -161,7 +161,7 @@ def start_state(shape: Shape, points: Vectors) -> State:
 
 
 def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
-    """Return equal tensions of all pairs, for which each force points to the contacts' centroid."""
+    """Return equal tensions for all pairs of contacts: each force then points to the centroid of the contacts."""
     pairs = contact_pairs(points.shape[1], points.device).shape[1]
     return normalise_tensions(points, points.new_ones(len(points), pairs))
 

@@ -53,7 +53,10 @@ def chunk_sizes(starts: int) -> list[int]:
 
 
 class Settled(NamedTuple):
-    """A specification with a known `flat_radius`, and candidates on flat surface with normals (None: no flatness)."""
+    """A specification with a known `flat_radius`, and candidates on flat surface with their normals.
+
+    `candidates` is None if the specification does not ask for flatness.
+    """
 
     spec: ContactSpec
     candidates: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]] | None
@@ -77,8 +80,9 @@ def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int
 
 
 def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
-    """Choose the largest `flat_radius` at which enough guesses are closed, if none is given; find flat candidates.
+    """Choose the largest `flat_radius` at which enough guesses have force closure, if none is given.
 
+    The candidates are the points at which the surface is flat.
     If too few points are flat, all points of `survey` are candidates.
     """
     if spec.flatness is None:
@@ -144,7 +148,10 @@ def candidate_rows(
     starts: int,
     generator: torch.Generator,
 ) -> tuple[Vectors, int]:
-    """Return random sets of candidate contacts, closed and well separated if possible, and how many are closed."""
+    """Return random sets of candidate contacts, and how many of them have force closure and are well separated.
+
+    Sets that have not are returned only if too few of the drawn sets have.
+    """
     rows, missing, f = [], starts, problem.fingertips
     for _ in range(ROUNDS):
         choice = torch.randint(len(points), (DRAWN_PER_START * starts, f), generator=generator).to(points.device)

@@ -44,7 +44,7 @@ def list_changes(request: Request) -> list[Change]:
 
 
 def more_starts(request: Request) -> Change:
-    """Return the change to four times as many initial guesses."""
+    """Return the change of settings that makes the planner try four times as many initial guesses."""
     more = dataclasses.replace(request, starts=4 * request.starts)
     return Change(f"with {more.starts} starts", True, frozenset(Status), more)
 

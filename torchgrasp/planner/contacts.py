@@ -25,7 +25,7 @@ LIKELY = 2
 
 
 class SeededContacts(NamedTuple):
-    """Closed contact sets, their certificates, and initial hand postures (seeds) for each set."""
+    """Contact sets with force closure, their certificates, and initial hand postures (seeds) for each set."""
 
     contacts: Contacts
     certificate: Certificate
@@ -50,7 +50,7 @@ def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
 
 
 def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable[..., None]) -> SeededContacts:
-    """Return at most `most` closed contact sets, far apart, with initial hand postures (seeds).
+    """Return at most `most` contact sets with force closure, far apart, with initial hand postures (seeds).
 
     In mode "paper" all sets are returned, the most certain first. `note` is called with the results of the stages
     "plan", "certify" and "query".
@@ -125,6 +125,6 @@ def contact_costs(problem: Problem, found: SeededContacts) -> Float[Tensor, "b"]
 
 
 def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:
-    """Return the coordinates (3 f) of each contact set as one vector, the lowest contact first."""
+    """Return each contact set as one vector of 3 f coordinates, with its f contacts sorted by height z."""
     order = torch.argsort(contacts.points[..., 2], dim=1, stable=True)
     return contacts.points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)

@@ -62,7 +62,7 @@ class Funnel(Value):
     @classmethod
     @checked
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
-        """Return the funnel from the observed values of the stages "plan", "certify", "query" and "refine"."""
+        """Return the losses, counted in the results of the stages "plan", "certify", "query" and "refine"."""
         far = len(closed) - len(seeds.row.unique())
         stages = (
             Losses("contacts", "starts", len(plan), _failures(plan.status)),
@@ -239,7 +239,7 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
 
 
 def try_request(request: Request) -> tuple[Funnel, float, ShapeGP]:
-    """Plan a request; return the funnel, the expected success and the estimated shape."""
+    """Plan a request; return how many grasps each stage lost, the expected success and the estimated shape."""
     told = dict[str, Any]()
     request = dataclasses.replace(request, observer=lambda stage, message, value: told.update({stage: value}))
     grasps = plan_grasps(**vars(request))

@@ -29,7 +29,7 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
     Args:
         scene: objects on a table.
         hand: from `load_hand`.
-        spec: the constraints on contacts; None: `ContactSpec()`.
+        spec: the constraints on contacts; `ContactSpec()` by default.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> set(judge_things(load_scene(), load_hand("barrett")).values()) == {Status.OK}

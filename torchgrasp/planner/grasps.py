@@ -80,21 +80,21 @@ def plan_grasps(
             sequence of clouds gives a list of results. A bad cloud gives no grasps, and `meta["refused"]` holds the
             reason.
         hand: from `load_hand`; it is moved to the device of the cloud.
-        spec: the constraints on contacts; each finger gets one contact. None: `ContactSpec()`, in mode "paper"
+        spec: the constraints on contacts; each finger gets one contact. The default is `ContactSpec()`, in mode "paper"
             `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
         time_budget: wall time [s]. No batch begins after it, so the result depends on the machine. `meta["starts"]`
-            is the number of initial guesses that were planned. None: no limit.
-        workers: processes for a sequence of clouds; 0: this process.
-        fingers: the fingers that grasp, as in `load_hand`; None: the fingers of `hand`. "auto": of the sets that the
-            hand declares, the set with the greatest expected success. `hand_of` loads the hand of the result.
+            is the number of initial guesses that were planned. None means no limit.
+        workers: number of processes for a sequence of clouds; 0 means this process.
+        fingers: the fingers that grasp, as in `load_hand`; by default those of `hand`. "auto" chooses, of the sets that
+            the hand declares, the one with the greatest expected success. `hand_of` loads the hand of the result.
         mode: see `Mode`. All modes but "joint" need the hand's learned model, and three fingers.
-        ranking: see `Ranking`; None: "success", in mode "paper" "variance".
+        ranking: see `Ranking`; by default "success", in mode "paper" "variance".
         shape: the object's shape if it is known better than the cloud shows, as after a touch (`ShapeGP.update`).
         observer: called after each stage with its name, a line of text and its value.
         reachable: returns as booleans (k,) which poses `obj_from_hand` (k, 4, 4) an arm reaches, in the given frame;
-            None: all poses are reachable.
+            by default all poses are reachable.
 
     Returns:
         Grasps: executable grasps (`Status.OK`) first, best first. `explain_empty` explains an empty result.

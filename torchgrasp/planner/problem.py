@@ -93,7 +93,7 @@ class Request:
 
     @property
     def order(self) -> Ranking:
-        """The given ranking, or the default of the mode."""
+        """The criterion that ranks the grasps: the given one, or else the default of the planning mode."""
         return self.ranking or ("variance" if self.mode == "paper" else "success")
 
     @property
@@ -234,7 +234,7 @@ class Problem:
         return None if given is None else lambda poses: given(frame.to(poses) @ poses)
 
     def reach(self, contacts: Contacts, certificate: Certificate) -> GraspProblem:
-        """Return the inverse kinematics problem for certified contacts."""
+        """Return the inverse kinematics problem for contacts and their certificate of force closure."""
         return GraspProblem(self.hand, contacts, certificate, self.world, self.center, self.reachable)
 
     def tell(self, stage: str, message: str, value: Any) -> None:

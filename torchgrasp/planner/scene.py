@@ -85,7 +85,7 @@ def plan_scene(
     Args:
         scene: objects on a table.
         hand: from `load_hand`.
-        spec: the constraints on contacts; None: `ContactSpec()`.
+        spec: the constraints on contacts; `ContactSpec()` by default.
         starts: number of random initial guesses of the contact planner for each object.
         seed: random seed.
         fingers: see `plan_grasps`; "auto" chooses fingers for each object. `hand_of` loads the hand of grasps.

@@ -24,7 +24,7 @@ TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes so
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The checkpoint file of one fit; `path` None: no file. Process 0 writes it, all processes read it.
+    """The checkpoint file of one fit; without a `path` there is none. Process 0 writes it, all processes read it.
 
     `centre` and `scale`, the data's mean and standard deviation, identify the data; `settings` identify the fit.
     """

@@ -11,10 +11,10 @@ REACH = 0.012  # distance [m] on either side of a crease over which its angle is
 
 
 def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """Return pieces cut along their concave creases into parts, numbered anew; the part 0 is the piece 0.
+    """Cut each piece along its concave creases, and return the number of the part of each pixel, 0 for none.
 
     Args:
-        image: of the pieces.
+        image: the depth image in which the pieces were found.
         pieces: number of the piece of each pixel, 0 for none.
     """
     from scipy.ndimage import find_objects

@@ -42,7 +42,7 @@ class DepthImage(Value):
 
     @property
     def frustum(self) -> Float[Tensor, "4 3"] | None:
-        """Inward normals of the sides of the camera's view, in the frame of `obj`; None: it has no border."""
+        """Inward normals of the sides of the camera's view, in the frame of `obj`, or None if it has no border."""
         if not self.bounded:
             return None
         return rotate(self.obj_from_camera.double(), frustum_of_image(self.intrinsics.double(), self.depth.shape))

@@ -59,7 +59,7 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
 
 
 def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
-    """Return the masks of a list, or of an array (k, h, w) or (k, 1, h, w); None: something else."""
+    """Return the masks of a list, or of an array (k, h, w) or (k, 1, h, w), or None for anything else."""
     if isinstance(labels, Tensor | np.ndarray):
         several = len(shape) == 2 and tuple(labels.shape[1:]) in (shape, (1, *shape))
         return labels.reshape(-1, *shape) if several else None

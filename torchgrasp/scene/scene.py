@@ -34,8 +34,8 @@ class Scene(Value):
         labels: 0 for the table and all that is no object; 1, 2, ... for the objects.
         image: what the camera measured: it shows free space and hidden space.
         pixels: row and column of each point in the image.
-        table: the plane that the objects stand on; None: unknown.
-        target: label of the object to be grasped; None: not chosen.
+        table: the plane that the objects stand on, or None if it is unknown.
+        target: label of the object to be grasped, or None if none is chosen.
         others: other planes that objects could stand on, the more plausible first.
         notes: what was removed of given masks or labels, a sentence each.
         given: labels whose pixels the user gave, as labels or as a mask; the library found the other objects.
@@ -79,13 +79,13 @@ class Scene(Value):
         Args:
             depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in millimetres.
             intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth` takes.
-            camera_pose: obj_from_camera (4, 4), rigid; None: results are in the camera's frame.
+            camera_pose: obj_from_camera (4, 4), rigid; without it results are in the camera's frame.
             mask: (h, w), not 0 at the target, which may be off by a few pixels; or in another form of `labels`.
             labels: (h, w) of whole numbers, 0 is no object; a picture with a colour for each object; a list of masks;
                 or COCO's run lengths.
             point: of the target: a pixel (u, v), or a point (x, y, z) [m].
-            table: a plane, or its height z [m]; None: it is fitted.
-            up: (3,), against gravity, for the fit; None: any direction.
+            table: a plane, or its height z [m]; by default it is fitted.
+            up: (3,), against gravity, for the fit; None allows any direction.
             depth_unit: metres of one count of the depth, as `cloud_from_depth` takes it.
 
         Raises:
@@ -239,7 +239,7 @@ class Scene(Value):
 
     @property
     def noise(self) -> SensorNoise | None:
-        """The camera's noise, estimated from the table; None: an unknown table, or too few pixels show it."""
+        """The camera's noise, estimated from the table; None if no table is known or too few pixels show it."""
         if self.table is None:
             return None
         image, rows = self.image, self.pixels[self.labels == 0]

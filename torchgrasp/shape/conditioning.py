@@ -152,7 +152,7 @@ def _extend(
 ) -> Posterior:
     """Return the posterior given `new` observations too, points with normals first; `whitened` is L^-1 y.
 
-    `new_order` gives the row of `Observations.rows` for each new row of the grown factor L; None: the same.
+    `new_order` gives the row of `Observations.rows` for each new row of the grown factor L, by default the same.
     """
     n, has = len(posterior.x), torch.cat([posterior.has_normal, new.has_normal])
     points = torch.argsort(~has, stable=True)

@@ -74,9 +74,9 @@ def fit_shape(
             normals distinguish a whole surface from a view. Walls thinner than the cloud's spacing merge, but an open
             vessel seen from above on a `table` has two walls (`HollowShape`).
         noise: standard deviation of an observed signed distance, normalised; with "paper" also of a normal.
-        budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. None: 85
-            for "camera", outline and mirrored points not counted, and 70 for "paper". "sure": until no point's variance
-            exceeds `noise`, the paper's rule, at most 1000.
+        budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. The default
+            is 85 for "camera", outline and mirrored points not counted, and 70 for "paper". "sure" adds points until no
+            point's variance exceeds `noise`, the paper's rule, at most 1000.
         psi_scale: ratio of the kernel's psi to the longest distance of the observations; below 1.34 the covariance may
             be indefinite.
         support: "camera" or "paper".

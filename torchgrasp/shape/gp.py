@@ -149,7 +149,7 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient, normalised, at up to 1000 points [m].
+        """Return the joint posterior of distance and gradient, in normalised units, at up to 1000 points [m].
 
         Raises the errors of `predict`.
         """
@@ -187,7 +187,7 @@ class ShapeGP(Posterior, Normalisation):
 
         Args:
             points: surface points [m] in the cloud's frame.
-            normals: outward normals of any length; None: unknown.
+            normals: outward normals of any length, or None if they are unknown.
             noise: standard deviation of a point [m] along the normal.
             normal_noise: standard deviation of the components of a unit normal.
 

@@ -33,7 +33,7 @@ class Kernel:
         diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it is a covariance
             everywhere.
         remedy: fix that the error suggests if the covariance is not positive definite.
-        closed_form: a faster `differentiate` of this profile, called with `r` and `count`; None: autograd.
+        closed_form: a faster `differentiate` of this profile, called with `r` and `count`; by default autograd.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]

@@ -25,7 +25,7 @@ class Posterior(Value):
         x: observed points, those with normals first.
         weights: (K + noise)^-1 y, in the order of `gram`'s rows.
         factor: lower Cholesky factor of K + noise. Later observations are last, wherever their points are in `x`.
-        order: row of `gram` for each row of the factor; None: the same.
+        order: row of `gram` for each row of the factor; by default the same.
     """
 
     x: Float[Tensor, "n 3"]
@@ -126,8 +126,10 @@ class Posterior(Value):
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance of the distance with their derivatives at normalised points, in closed form.
 
-        With weights (a, b) of distances and normals, d = x - x_j and derivatives of k in |d|^2 / 2, the mean is
-        sum_j a_j k - k' d.b_j. The gradient of the variance k0 - k*^T A k* is -2 times that of a mean of weights A k*.
+        The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2). Here a_j is the weight of the
+        distance at the observed point x_j, and b_j that of its normal. The variance is k0 - k*^T A k*: k0 is the prior
+        variance, k* the covariance of the point with the data, and A the inverse covariance of the data. Its gradient
+        is -2 times the gradient of a mean with the weights A k*.
         """
         return SurfaceJet(*in_chunks(partial(_jet, self), x, 256 if x.device.type == "cpu" else 16384))
 

@@ -49,8 +49,8 @@ class Support(Value):
         normal_noise: standard deviation of the cloud's normals.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
         parts: observed points of the outline and of the hidden side.
-        free: points in free space; None: not used.
-        rows: mask of the cloud's points that lie on this surface; None: all points.
+        free: points in free space, or None if they are not used.
+        rows: mask of the cloud's points that lie on this surface; None means all points.
         kind: see `ShapeGP`.
     """
 
@@ -173,7 +173,10 @@ def vessel_supports(
 
 
 def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: Normalisation) -> Middle:
-    """Return points half a thickness behind both walls, without handles and rim."""
+    """Return points in the middle of the vessel's wall, without handles and rim.
+
+    Points on its outer and inner surface, seen or estimated, are moved into the material by half the thickness.
+    """
     assert cloud.normals is not None
     points, normals = [], []
     for wall, seen in zip(walls, (vessel.body & ~vessel.inner, vessel.inner), strict=True):

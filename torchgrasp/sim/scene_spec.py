@@ -38,8 +38,8 @@ class Neighbour:
 
     Args:
         mesh: closed mesh [m] in the frame of the grasp.
-        parts: convex bodies that make up the mesh; None: `convex_parts` of the mesh.
-        mass: mass [kg]; None: from `TrialSpec.mass` or `TrialSpec.density`, as for the object.
+        parts: convex bodies that make up the mesh; by default `convex_parts` of the mesh.
+        mass: mass [kg]; by default from `TrialSpec.mass` or `TrialSpec.density`, as for the object.
     """
 
     mesh: "trimesh.Trimesh"
@@ -82,10 +82,10 @@ class SceneSpec:
         approach: displacement [m] from the hand's start to the pose `world_from_hand`.
         table: whether there is a table.
         patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x patch.
-        height: height of the table [m]; None: the lowest point of the mesh.
+        height: height of the table [m]; by default the lowest point of the mesh.
         neighbours: other bodies on the table.
         self_pairs: pairs of the hand's links that collide with each other.
-        yields: largest displacement [m] of the mount along each axis of the world; 0: the mount is stiff.
+        yields: largest displacement [m] of the mount along each axis of the world; 0 if the mount is stiff.
     """
 
     urdf_path: Path | str

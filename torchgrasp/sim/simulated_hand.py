@@ -52,7 +52,7 @@ class SimulatedHand:
         scene: a scene at its initial state.
         reference: the closing plan.
         control_rate: rate of control ticks [Hz].
-        generator: draws the noise of the fingertips; None: no noise.
+        generator: draws the noise of the fingertips; without one there is no noise.
     """
 
     def __init__(

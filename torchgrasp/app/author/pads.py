@@ -134,7 +134,7 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
 
 
 def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
-    """Return a point near the far end of a tip, in its frame; in a simple shape half a thickness before the end."""
+    """Return a point near the far end of a tip, in its frame: half its thickness before the end of a simple shape."""
     if not is_primitive(link):
         points, pose = surfaces[link.name], pose_in_carrier(urdf, link.name)[1].numpy()
         reach = np.linalg.norm(points @ pose[:, :3].T + pose[:, 3], axis=1)

@@ -82,7 +82,7 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
 
 
 def _under(joint: Joint, above: Joint) -> Joint:
-    """Return a joint moved from a merged frame to the frame's parent."""
+    """Return a joint attached to the parent of a frame that is merged away, with its origin adjusted."""
     xyz, rpy = place(pose_of(above) @ pose_of(joint))
     return dataclasses.replace(joint, parent=above.parent, xyz=xyz, rpy=rpy)
 

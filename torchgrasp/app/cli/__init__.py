@@ -214,7 +214,7 @@ class _WithoutMarkup:
         self.stream = stream
 
     def write(self, text: str) -> int:
-        """Write the text without markup; a frame around the text stays aligned."""
+        """Write the text with its markup removed. If the text is framed, the right border stays aligned."""
         room = " " * len("[bold][/bold]")
         return self.stream.write(
             re.sub(r"\[bold\](.*?)\[/bold\](.*?)( │?)$", rf"\1\2{room}\3", text, flags=re.MULTILINE)

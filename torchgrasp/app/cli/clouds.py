@@ -65,7 +65,7 @@ class CloudCheck(Command):
 
 
 def _no_view(cloud: PointCloud) -> BadArgument | None:
-    """Return the error for a cloud that no single camera can see, which `fit_shape` rejects; None: no error."""
+    """Return the error for a cloud that no single camera can see, which `fit_shape` rejects, or None."""
     some = cloud.select(draw_rows(len(cloud), 20_000))  # more points give no more certainty
     try:
         seen = prepare_cloud(some, torch.Generator().manual_seed(0))

@@ -54,7 +54,7 @@ class _DepthCommand(Command):
 
     @property
     def vertical(self) -> Tensor | None:
-        """The vertical as a unit vector; None: not given."""
+        """The vertical as a unit vector, or None if it is not given."""
         given: Any = {"up": self.up}
         return ViewOptions(**given).vertical
 

@@ -75,7 +75,7 @@ class Export(Command):
 
 @arguments(order="joints", pregrasp="file", obj_from_hand="file", std_m="std")
 class Import(Command):
-    """Read grasps of another program, prove which are closed, and write them as grasps.safetensors.
+    """Read grasps of another program, prove which have force closure, and write them as grasps.safetensors.
 
     `torchgrasp export` and `torchgrasp evaluate --planned` accept the file. Accepted are JSON of `torchgrasp export`,
     JSON with "pose" and "dofs" (MultiGripperGrasp), and .npz with DexGraspBench's names.
@@ -123,7 +123,7 @@ class Import(Command):
             return formats.grasps_from_joints(hand, joints, poses, opened, spec, self.std)
 
     def _check(self, hand: Hand, grasps: Grasps, cloud: PointCloud) -> None:
-        """Refuse grasps that are elsewhere than the cloud; name the options with which they are on it."""
+        """Refuse grasps that are not on the cloud; the error names the options with which they would be."""
         error = _contradiction(grasps, cloud)
         if error is None:
             return
@@ -135,7 +135,7 @@ class Import(Command):
 
 
 def _contradiction(grasps: Grasps, cloud: PointCloud) -> BadArgument | None:
-    """Return the error of grasps that are elsewhere than the cloud."""
+    """Return the error to raise if grasps are not on the cloud, else None."""
     try:
         check_agreement("FILE", grasps.contacts.points.reshape(-1, 3), "the contacts", cloud, slack=0.03, share=0.5)
     except BadArgument as error:

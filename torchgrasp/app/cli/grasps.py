@@ -161,7 +161,7 @@ class Grasp(Command):
         return 0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
 
     def _true_mesh(self, path: Path) -> Path | None:
-        """Return the path of the true mesh for the simulated closing; None: no closing."""
+        """Return the path of the true mesh for the simulated closing, or None if no closing is simulated."""
         shipped = path != self.cloud  # the cloud is given by name
         mesh = path.with_name("mesh.ply") if shipped and self.close and self.mesh is None else self.mesh
         if self.close:

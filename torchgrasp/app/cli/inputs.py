@@ -58,7 +58,7 @@ class ViewOptions:
 
     @property
     def vertical(self) -> Tensor | None:
-        """The vertical as a unit vector; None: z."""
+        """The vertical as a unit vector; None means z."""
         if self.up is None:
             return None
         vector = check_tensor("--up", torch.tensor(self.up, dtype=torch.float64), (3,))
@@ -125,7 +125,7 @@ class CloudOptions(ViewOptions):
         return given if up is None else Plane(up, given)
 
     def given_vertical(self, plane: Plane | None) -> Tensor | None:
-        """Return the vertical of --up or of --table; None: neither is given."""
+        """Return the vertical of --up or of --table, or None if neither is given."""
         return self.vertical if self.up is not None or self.table is None or plane is None else plane.normal
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
@@ -203,7 +203,7 @@ def check_folder(path: Path) -> None:
 def holding(
     name: str, path: Path | None, hold: Callable[[Path], AbstractContextManager[None]] = hold_folder
 ) -> Iterator[None]:
-    """Lock the folder, or file, of an option against other runs within the context; None: no lock."""
+    """Lock the folder, or file, of an option against other runs within the context. None locks nothing."""
     with contextlib.ExitStack() as held:
         if path is not None:
             with naming(folder=name, path=name):

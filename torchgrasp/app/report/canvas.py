@@ -90,7 +90,7 @@ class Canvas:
                 self.add_mesh(length * part.vertices @ turn.T + start, part.faces, color)
 
     def add_table(self, corners: Float[np.ndarray, "n 3"], height: float | None) -> None:
-        """Add a round table top, without shading, under `corners` at a height [m]; None: no table."""
+        """Add a round table top, without shading, under `corners` at a height [m], unless the height is None."""
         from trimesh import creation
 
         if height is None:
@@ -107,7 +107,10 @@ class Canvas:
     def render_png(
         self, corners: Float[np.ndarray, "n 3"], direction: Direction, bar: tuple[str, float, str] | None = None
     ) -> bytes:
-        """Return a PNG of all `corners` [m]; `bar` is title, largest value and colour map of a bar at the bottom."""
+        """Return a PNG of the scene, framed so that all `corners` [m] are visible.
+
+        `bar` is title, largest value and colour map of a colour bar at the bottom.
+        """
         from PIL import Image
 
         image = Image.fromarray(self.render(frame_camera(corners, direction, 0.09 if bar else 0.0)))

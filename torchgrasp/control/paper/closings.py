@@ -181,8 +181,8 @@ class Impedance:
     """Hold the object like a spring between the fingertips: object-level impedance, by joint targets q + J^T f / kp.
 
     At rest the forces are the desired forces, balanced at the sensed contacts. Null-space motions of the joints are
-    suppressed. `springs` [N/m] act along the sides of the triangle of fingertips; None: of `GRASP_STIFFNESS`. If the
-    `stability` model judges the grasp unstable, forces and stiffness rise and stay high; None: they do not adapt.
+    suppressed. Springs of stiffness `springs` [N/m], by default `GRASP_STIFFNESS`, act along the sides of the triangle
+    of fingertips. If the `stability` model, where given, judges the grasp unstable, forces and stiffness stay raised.
     """
 
     def __init__(

@@ -84,7 +84,7 @@ class StabilityModel(Value):
     def preferred_forces(self, tips: Float[Tensor, "3 3"], force: Positive | None = None) -> PreferredForces:
         """Return forces and stiffness of stable grasps with the same distances between the `tips` [m] [6].
 
-        `force` [N] is that of the finger that presses hardest; None: the model's own.
+        `force` [N] is that of the finger that presses hardest; by default the model's own.
         """
         lengths = lengths_of(tips.double())
         given = dict(zip(LENGTHS, lengths.log().tolist(), strict=True))
@@ -123,7 +123,7 @@ class StabilityModel(Value):
 
 @checked
 def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel | None:
-    """Read the stability model of a hand from a file; None: `FILE` in the hand's folder, no model without the file.
+    """Read the stability model of a hand from `path`, or from `FILE` in the hand's folder; None if that does not exist.
 
     Raises:
         ModelFileError: the file is missing or malformed.

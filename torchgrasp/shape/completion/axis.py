@@ -39,7 +39,7 @@ class Revolution:
 
 
 def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution] | None:
-    """Return the frame `axis_from_cloud` of an axis of revolution, and the body about its z axis; None: no axis.
+    """Return the frame `axis_from_cloud` of an axis of revolution, and the body about its z axis, or None.
 
     The axis is fitted to the scorer's probes. The body, rotated about it, must stay out of free space and the table.
     """
@@ -63,7 +63,7 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
 
 def find_revolution(points: Points, normals: Points) -> Revolution | None:
-    """Return the upright body of revolution to which most points belong; None: there is none."""
+    """Return the upright body of revolution to which most points belong, or None if there is none."""
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
     mask = _round_body(points, lines, center, lambda radius, _: MAX_SPREAD * radius.clamp_min(LEAST_RADIUS))

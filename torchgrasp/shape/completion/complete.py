@@ -42,12 +42,14 @@ SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
-    """Estimated points of the hidden side; errors along the normals have the covariance LEAST_NOISE^2 I + D D^T [m^2].
+    """Estimated points of the hidden side, with their errors along the normals.
+
+    The errors have the covariance LEAST_NOISE^2 I + D D^T [m^2], where I is the identity and D is `deviations`.
 
     Args:
         shared: standard deviations [m] of the errors that each mirror plane causes.
-        asymmetry: standard deviation [m] of the smooth field.
-        planes: the planes n.x = o that were used, as (n, o), the best of each part first.
+        asymmetry: standard deviation [m] of a smooth random error, because the object is not quite symmetric.
+        planes: the planes n.x = o that were used, as (n, o); for each part of the object, its best plane is first.
         scores: score of each plane: 1 if the mirror image lies on the cloud, near 0 without support.
         kind: how the hidden side was completed, which selects the calibration.
     """

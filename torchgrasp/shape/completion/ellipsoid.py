@@ -41,7 +41,7 @@ class Ellipsoid:
 
 
 def find_ellipsoid(points: Points, normals: Points, outline: Outlines, table: float | None) -> Ellipsoid | None:
-    """Return the ellipsoid, nearly a ball, that fits the whole cloud; None: no such ellipsoid fits.
+    """Return the ellipsoid, nearly a ball, that fits the whole cloud, or None if there is none.
 
     The body may have a flat foot: the ellipsoid may reach below the table, but not float above it.
     """

@@ -22,17 +22,17 @@ TIE = 2e-9  # relative difference of squared distances by rounding: the frame mu
 
 @dataclasses.dataclass(frozen=True)
 class Silhouette(Value):
-    """The outline and visible depth of one view, as images at depth 1.
+    """The outline and visible depth of one view, as rasters on the image plane at depth 1.
 
     Args:
         axes: right, down and forward axis of the camera, as rows.
         corner, cell: first node of the raster and spacing of the nodes, at depth 1.
         outside: signed distance to the outline at depth 1, positive outside.
-        depth: depth [m] of the nearest visible pixel.
+        depth: at each node, the depth [m] of the visible pixel nearest to the node.
         rim: points of the outline [m] at the visible depth.
         rim_normals: surface normals at the rim points, perpendicular to the camera rays.
         cut: whether the object reaches the border of the image. Points beyond the border do not count as outside.
-        gap: greatest width [m] of an area within the outline without measurements, perhaps a hole; 0: none.
+        gap: greatest width [m] of an area within the outline without measurements, perhaps a hole; 0 if there is none.
     """
 
     viewpoint: Float[Tensor, "3"]

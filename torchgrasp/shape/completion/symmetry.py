@@ -35,13 +35,14 @@ Mirrors = Float[Tensor, "_ 4"]
 """Mirror planes n.x = o, given as (n, o)."""
 Directions = Float[Tensor, "d 3"]
 View = Float[Tensor, "3"] | None
-"""The direction of the view; None: from above or from several sides, where no side alone is hidden."""
+"""The direction of the view. It is None for views from above or from several sides, where no single side is hidden."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryScorer:
-    """Scores mirror planes: compares mirrored probes, the points `rows`, with the cloud, its outlines and the table.
+    """Scores mirror planes: mirrors some points of the cloud, the probes, and compares them with what is known.
 
+    The probes are the points `rows`. Their images are compared with the cloud, its outlines and the table.
     `upright` means that all planes are parallel to z: the vertical direction, or the axis of a body of revolution.
     """
 
@@ -54,13 +55,16 @@ class SymmetryScorer:
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
-        """Return the scorer of a cloud with normals, with probes from all points. `table` is the table's height [m]."""
+        """Return the scorer of mirror planes of a cloud with normals. Any point may become a probe.
+
+        `table` is the table's height [m].
+        """
         assert cloud.normals is not None
         plane, every = None if table is None else Plane.horizontal(table), torch.arange(len(cloud))
         return cls(cloud.points, cloud.normals, silhouettes(cloud), plane, table is not None, every).for_part(every)
 
     def about_axis(self, axis_from_cloud: Float[Tensor, "4 4"]) -> "SymmetryScorer":
-        """Return the scorer in another frame, whose z axis is an axis of revolution."""
+        """Return the scorer in a frame whose z axis is the axis of revolution."""
         points, normals = apply(axis_from_cloud, self.points), rotate(axis_from_cloud, self.normals)
         table = None if self.table is None else self.table.moved(axis_from_cloud)
         return SymmetryScorer(points, normals, self.outline.moved(axis_from_cloud), table, True, self.rows)
@@ -118,9 +122,10 @@ class SymmetryScorer:
 def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, Float[Tensor, "p"]]:
     """Return the mirror planes of a cloud, best first, and their scores.
 
-    On a table only vertical planes are tried. A plane perpendicular to the best is added if no plane is near it,
-    because its images are hidden; a horizontal plane halfway up gives the underside. All planes through the axis of a
-    body of revolution (`turned`) match: it needs neither.
+    On a table, the search tries only vertical planes. A plane perpendicular to the best one is added if none was found
+    near it: its mirror images are hidden, so that the cloud cannot confirm it. A horizontal plane at half the height is
+    added to give the underside. A body of revolution (`turned`) needs neither, because every plane through its axis
+    matches.
     """
     view = torch.stack([unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]).mean(0)
     if not scorer.upright:

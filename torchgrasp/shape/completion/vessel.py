@@ -43,7 +43,7 @@ class Vessel(Value):
 
 
 def find_vessel(points: Points, normals: Points) -> Vessel | None:
-    """Return the open vessel that a cloud shows; None: the cloud shows no vessel.
+    """Return the open vessel that a cloud shows, or None if it shows no vessel.
 
     Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a cubic polynomial of
     the height, and the inner radius is less by thickness / slope of the normal. Robust weights (Cauchy) ignore handles.
@@ -174,7 +174,10 @@ def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float
 
 
 def _merge(seen: Points, outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float) -> HiddenWall:
-    """Return points of the parts, first parts first, that are new, hidden, below the rim and above height `least`."""
+    """Return the points of the parts that are hidden, below the rim and above the height `least`.
+
+    Points near the seen points, or near points of an earlier part, are left out.
+    """
     from scipy.spatial import KDTree
 
     tree = KDTree(seen.numpy())
