@@ -30,11 +30,11 @@ from torchgrasp.specs import Ranking
 from torchgrasp.values import ContactPlan, Grasps, format_success
 
 FIRST, GROWTH = 8, 6
-"""Rows of contacts that the hand tries in the first batch, and the ratio of the sizes of successive batches."""
+"""Number of contact sets that the hand tries in the first batch, and ratio of the sizes of successive batches."""
 FIRST_STEPS = 8
-"""Most steps of the solver in the first batch; the second batch tries unsolved rows again with all steps."""
+"""Most steps of the solver in the first batch; the second batch tries unsolved contact sets with all steps."""
 TRIED, TRIED_IN_SCENE = 250, 160
-"""Most rows of contacts that the hand tries. In a scene more postures of each row are tried."""
+"""Most contact sets that the hand tries: fewer in a scene, because there it tries more postures for each set."""
 OFFERED = 4  # planned rows for each row that the hand tries
 
 
@@ -46,7 +46,7 @@ class Batch(NamedTuple):
 
 
 def schedule(starts: int, most: int) -> list[Batch]:
-    """Return batches with `starts` initial guesses and `most` contact sets in all; a small rest joins the last."""
+    """Return batches with `starts` guesses and `most` contact sets in all; a small remainder joins the last batch."""
     batches, size, most = list[Batch](), FIRST, min(most, starts)
     tried = planned = 0
     while tried < most:
@@ -69,16 +69,17 @@ class Planner:
     def __init__(self, problem: Problem) -> None:
         """Begin without any grasps.
 
-        `unfinished` holds contact sets that had few solver steps, `unsolved` those that had all steps; both with the
-        best failed grasps.
+        `unfinished` holds contact sets on which a few solver steps failed, `unsolved` sets on which all steps failed.
+        Both hold the best failed grasp of each set, too.
         """
         self.problem, self.pool, self.first = problem, Pool(), True
         self.unfinished, self.unsolved = (list[tuple[SeededContacts, Grasps]]() for _ in range(2))
 
     def run(self, deadline: float) -> Iterator[Grasps]:
-        """Yield the grasps of each batch in the upright frame, executable ones first; `meta` counts the guesses so far.
+        """Yield the grasps of each batch in the upright frame, executable ones first.
 
-        No batch begins after `deadline`, a time of `time.monotonic`.
+        `meta` says how many initial guesses were planned so far. No batch begins after `deadline`, a time of
+        `time.monotonic`.
         """
         problem, request = self.problem, self.problem.request
         check_starts(problem.shape, problem.given_spec, request.starts)
@@ -208,7 +209,7 @@ class Report:
             self._tell(stage)
 
     def end_batch(self, grasps: Grasps, last: bool) -> None:
-        """Report the end of a batch; after the `last` batch report the stages that are not yet reported."""
+        """Report that a batch has ended; if it is the `last` one, report the stages not yet reported, too."""
         self.ended += 1
         if self.ended < self.batches:
             good = int(executable(grasps).sum())
@@ -220,7 +221,7 @@ class Report:
                 self._tell(stage)
 
     def _tell(self, stage: str) -> None:
-        """Report a stage with the results of all batches so far."""
+        """Report to the observer the results of one stage, from all batches so far."""
         value = join(self.parts[stage])
         if stage == "plan":
             text = f"{len(value)} starts: {describe(count_status(value.status))}"

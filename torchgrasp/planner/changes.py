@@ -19,10 +19,10 @@ OF_HAND = frozenset(status for status in Status if Status.OUT_OF_REACH <= status
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A request with one change, which `words` describe.
+    """A planning request with one change, which `words` describe.
 
-    With `choice` the user can make the change; without, it is a fact about the world. `cures` are the failures that it
-    could prevent. With `refit` the shape is estimated anew.
+    If `choice` is true the user can make the change; otherwise it is a change of the world, such as a higher friction.
+    `cures` are the failures that the change could prevent. If `refit` is true, the object's shape is estimated anew.
     """
 
     words: str
@@ -38,7 +38,7 @@ def _with(request: Request, **fields: Any) -> Request:
 
 
 def list_changes(request: Request) -> list[Change]:
-    """Return every single change of a request that could give grasps, except the change to more initial guesses."""
+    """Return all changes of a request, each of one setting, that could give grasps, but not more initial guesses."""
     kinds = (_surroundings, _fingers, _limits, _friction, _hands)
     return [change for kind in kinds for change in kind(request)]
 
@@ -50,7 +50,7 @@ def more_starts(request: Request) -> Change:
 
 
 def _fingers(request: Request) -> Iterator[Change]:
-    """Yield changes to the other sets of fingers that the hand declares; in other modes, the change to mode "joint"."""
+    """Yield a change to each other set of fingers of the hand; in a mode other than "joint", a change to "joint"."""
     mode, fingers = request.mode, request.fingers
     if mode != "joint":
         yield Change("with mode='joint'", True, OF_HAND | OPEN, dataclasses.replace(request, mode="joint"), refit=True)
@@ -64,7 +64,7 @@ def _fingers(request: Request) -> Iterator[Change]:
 
 
 def _hands(request: Request) -> Iterator[Change]:
-    """Yield changes to the other shipped hands, without variants such as the left hand."""
+    """Yield a change to each other shipped hand, except variants such as the left hand; only in mode "joint"."""
     if request.mode != "joint":
         return
     names = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))
@@ -76,7 +76,7 @@ def _hands(request: Request) -> Iterator[Change]:
 
 
 def _limits(request: Request) -> Iterator[Change]:
-    """Yield changes that relax one limit of the contacts: to its default, or beyond the default."""
+    """Yield changes that each relax one limit on contacts: to the default limit, or beyond it."""
     spec, tips = request.contact_spec, float(request.hand.tips.radius.max())
     own = spec.for_fingertips(tips)
     if (wider := _next((0.03, 0.1), spec.max_variance)) is not None:
@@ -100,12 +100,12 @@ def _limits(request: Request) -> Iterator[Change]:
 
 
 def _next(limits: tuple[float, ...], present: float) -> float | None:
-    """Return the first of `limits` above the present limit, or None."""
+    """Return the first of `limits` above the present limit, or None if none is above."""
     return next((limit for limit in limits if limit > present), None)
 
 
 def _friction(request: Request) -> Iterator[Change]:
-    """Yield changes to the next two clearly higher friction coefficients."""
+    """Yield changes to the next two of `FRICTIONS` that are clearly above the present friction coefficient."""
     present = request.contact_spec.friction
     for friction in [f for f in FRICTIONS if f >= 1.4 * present][:2]:
         words = f"if the friction were {friction:g} instead of {present:g}"

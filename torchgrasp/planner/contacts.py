@@ -1,4 +1,4 @@
-"""The contact sets that the hand tries: planned, certified, with initial hand postures, the most promising first."""
+"""The contact sets that the hand tries: planned, checked for force closure, and given initial hand postures."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from torchgrasp.posture_model.mixture import PAPER_ENERGY
 from torchgrasp.values import Certificate, ContactPlan, Contacts, IKSeeds
 
 LIKELY = 2
-"""Size of the pool of cheapest rows, over the number of rows that are taken from it by farthest-point sampling."""
+"""Farthest-point sampling takes n contact sets from the `LIKELY` * n sets with the lowest cost."""
 
 
 class SeededContacts(NamedTuple):
@@ -41,7 +41,7 @@ class SeededContacts(NamedTuple):
 
 
 def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
-    """Return the contact sets of all parts, concatenated."""
+    """Return several groups of contact sets as one group, in order."""
     first, seeds = 0, list[IKSeeds]()
     for part in parts:
         seeds.append(dataclasses.replace(part.seeds, row=part.seeds.row + first))
@@ -50,10 +50,10 @@ def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
 
 
 def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable[..., None]) -> SeededContacts:
-    """Return at most `most` contact sets with force closure, far apart, with initial hand postures (seeds).
+    """Choose at most `most` planned contact sets, far apart; return those with force closure, and hand postures.
 
-    In mode "paper" all sets are returned, the most certain first. `note` is called with the results of the stages
-    "plan", "certify" and "query".
+    In mode "paper" with ranking "variance" all sets are chosen, the most certain first. `note` is called with the
+    results of the stages "plan", "certify" and "query".
     """
     request = problem.request
     note("plan", plan)
@@ -74,7 +74,7 @@ def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable
 
 @checked
 def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
-    """Return the indices of at most `most` successful contact sets that are far apart, in plan order."""
+    """Return the indices of at most `most` successful contact sets of a plan that lie far apart, in ascending order."""
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
         return rows
@@ -83,7 +83,7 @@ def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
 
 
 def find_seeds(problem: Problem, contacts: Contacts) -> IKSeeds:
-    """Return initial hand postures near contacts: random ones in mode "joint", else from the learned model."""
+    """Return initial hand postures near contacts: in mode "joint" random postures, else those of the learned model."""
     if problem.mixture is None:
         return nearest_postures(problem.library, contacts, problem.world, reachable=problem.reachable)
     if problem.request.mode == "paper":
@@ -92,13 +92,13 @@ def find_seeds(problem: Problem, contacts: Contacts) -> IKSeeds:
 
 
 class Pool:
-    """The contact sets of all batches so far; each set is taken at most once."""
+    """A store of the contact sets of all batches so far; each set is taken from it at most once."""
 
     def __init__(self) -> None:
         self.parts, self.costs, self.taken = list[SeededContacts](), list[Tensor](), list[Tensor]()
 
     def add(self, found: SeededContacts, cost: Float[Tensor, "n"]) -> None:
-        """Add contact sets with their costs, infinite for a set without seeds."""
+        """Add contact sets with their costs; the cost is infinite for a set without initial hand postures (seeds)."""
         self.parts.append(found)
         self.costs.append(cost)
 
@@ -115,7 +115,7 @@ class Pool:
 
 
 def contact_costs(problem: Problem, found: SeededContacts) -> Float[Tensor, "b"]:
-    """Return the cost of each contact set: log of its first two seeds' least residual, plus log of the load's arm."""
+    """Return one cost per contact set: large if its first two hand postures miss it, or the load has a long arm."""
     contacts, certificate, seeds = found
     first = seeds[rank_in_group(seeds.row) < 2]
     residual = seed_costs(problem.reach(contacts, certificate), first)

@@ -36,7 +36,7 @@ class Losses(Value):
 
     @property
     def kept(self) -> int:
-        """The number that passes on to the next stage."""
+        """The number of things that the stage did not lose."""
         return self.given - sum(self.lost.values())
 
     @property
@@ -52,9 +52,9 @@ class Losses(Value):
 class Funnel(Value):
     """The losses of each planning stage, from random initial guesses to executable grasps.
 
-    Stage "contacts" counts contact sets planned from initial guesses. Stage "postures" loses contact sets without a
-    hand posture nearby; the most promising others are tried. Stage "grasps" counts executable grasps; each failure is
-    counted for the check that its best posture fails.
+    Stage "contacts" turns initial guesses into contact sets. Stage "postures" loses the contact sets that no hand
+    posture comes near; the hand tries the most promising of the others. Stage "grasps" turns them into executable
+    grasps; each failure is counted for the check that its best posture fails.
     """
 
     stages: tuple[Losses, ...]
@@ -84,12 +84,12 @@ class Funnel(Value):
 
     @property
     def reason(self) -> Status:
-        """The most frequent reason for losses in the worst stage; `Status.OK` if nothing was lost."""
+        """The most frequent reason for losses in the stage `worst`; `Status.OK` if nothing was lost."""
         return next(iter(self.worst.lost), Status.OK)
 
     @checked
     def share(self, reasons: frozenset[Status]) -> float:
-        """Return the fraction lost for the given reasons, summed over the stages."""
+        """Return the sum over the stages of the fraction that a stage lost for any of the given reasons."""
         shares = (n / stage.given for stage in self.stages for status, n in stage.lost.items() if status in reasons)
         return sum(shares, 0.0)
 
@@ -98,7 +98,7 @@ class Funnel(Value):
 
 
 def _failures(status: Int[Tensor, "b"]) -> dict[Status, int]:
-    """Count each status other than OK, the most frequent first."""
+    """Return how often each status other than OK occurs, the most frequent first."""
     return {name: n for name, n in count_status(status).items() if name is not Status.OK}
 
 
@@ -106,7 +106,8 @@ def _failures(status: Int[Tensor, "b"]) -> dict[Status, int]:
 class Trial(Value):
     """The result of planning with one change: the number of executable grasps, and their expected success.
 
-    With `choice` the user can make the change; without, it is a fact about the world.
+    `words` describe the change. If `choice` is true the user can make it; otherwise it is a change of the world, such
+    as a higher friction.
     """
 
     words: str
@@ -123,8 +124,8 @@ class Trial(Value):
 class Explanation(Value):
     """Why there is no grasp: where grasps were lost, and the results of single changes, the most helpful first.
 
-    Each change was planned from `starts` initial guesses. `str` gives one line for each stage, and a sentence about the
-    best change.
+    For each change, grasps were planned from `starts` initial guesses. `str` gives one line for each stage, and a
+    sentence about the best change.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
     >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
@@ -172,10 +173,11 @@ def explain_empty(
 ) -> Explanation:
     """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
 
-    Each change is planned with the same seed and at most 100 initial guesses: other fingers, another shipped hand,
-    wider limits of contacts, higher friction, no table, no neighbours, an arm that reaches everything. At most eight
-    changes are tried, in the order of the losses that they could prevent. The search ends at a change that the user can
-    choose and whose 20 best grasps are likely to succeed. If no change helps, more initial guesses are tried.
+    The changes are: other fingers, another shipped hand, wider limits of contacts, higher friction, no table, no
+    neighbours, an arm that reaches everything. Grasps are planned for each with the same seed and at most 100 initial
+    guesses. At most eight changes are tried, in the order of the losses that they could prevent. The search ends at a
+    change that the user can choose and whose 20 best grasps are likely to succeed. If no change helps, more initial
+    guesses are tried.
 
     Args:
         cloud, hand, spec, starts, seed: as in `plan_grasps`.
@@ -220,7 +222,7 @@ def explain_empty(
 
 
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
-    """Return the changes that could prevent most losses, the most helpful first.
+    """Return the changes that could prevent the most losses, the most helpful first; drop the others.
 
     A change counts fully for the failures that it prevents, and one fifth for other failures of the same stage, because
     a failed contact set reports only one of its failures.

@@ -1,4 +1,4 @@
-"""Whether a hand can grasp an object of a scene, and how easily, judged by its picture before it is planned."""
+"""Whether a hand can grasp an object of a scene, and how easily, judged from the depth image before planning."""
 
 import math
 
@@ -24,7 +24,9 @@ LEAST_PIXELS = 100  # fewer pixels are a speck of noise, or too coarse for a sha
 
 @checked
 def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> dict[int, Status]:
-    """Return for each object the first reason why the hand cannot grasp it, or `Status.OK`; it takes milliseconds.
+    """Return for each object's label the first reason why the hand cannot grasp the object, or `Status.OK`.
+
+    The objects are judged from the depth image alone, without planning, in milliseconds.
 
     Args:
         scene: objects on a table.
@@ -50,7 +52,7 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
 
 
 def _judge(scene: Scene, points: Float[Tensor, "n 3"], label: int, spec: ContactSpec, span: float) -> Status:
-    """Return the first reason against an object with points in the upright frame."""
+    """Return the first reason why a hand of this `span` [m] cannot grasp an object; `points` have z up."""
     pixels, bounded = scene.pixels[scene.labels == label].cpu(), scene.image.bounded
     if len(pixels) < LEAST_PIXELS:
         return Status.FEW_PIXELS
@@ -72,7 +74,7 @@ def _stand_upright(scene: Scene) -> tuple[Float[Tensor, "n 3"], Int[Tensor, "n"]
 
 
 def _is_cut(pixels: Tensor, shape: tuple[int, ...]) -> bool:
-    """Return whether a border of the image cuts an object where it is wider than the object reaches into the image."""
+    """Return whether the image border cuts an object: it is longer along the border than it extends into the image."""
     for axis in (0, 1):
         for depth in (pixels[:, axis], shape[axis] - 1 - pixels[:, axis]):
             along = pixels[depth <= 1, 1 - axis]
@@ -82,7 +84,7 @@ def _is_cut(pixels: Tensor, shape: tuple[int, ...]) -> bool:
 
 
 def _is_see_through(pixels: Tensor, depth: Float[Tensor, "h w"]) -> bool:
-    """Return whether more pixels between those of an object lack depth than the object has pixels."""
+    """Return whether most of an object lacks depth: more pixels without depth lie between its pixels than it has."""
     own, box = np.zeros(depth.shape, dtype=bool), tuple(slice(int(x.min()), int(x.max()) + 1) for x in pixels.T)
     own[tuple(pixels.T.numpy())] = True
     part, reach = own[box], np.logical_or.accumulate
@@ -91,7 +93,7 @@ def _is_see_through(pixels: Tensor, depth: Float[Tensor, "h w"]) -> bool:
 
 
 def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:
-    """Return the diameter [m] of the largest disc that points fill, in cells of this side [m]."""
+    """Return the diameter [m] of the largest disc in the area that points fill, on a grid with this `cell` side [m]."""
     from scipy.ndimage import binary_closing, distance_transform_edt
 
     place = torch.floor((points - points.amin(0)) / cell).long().numpy() + 2
@@ -102,7 +104,7 @@ def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:
 
 
 def hand_span(hand: Hand) -> float:
-    """Return the largest distance [m] between two pads that face each other within their cones, over random joints."""
+    """Return the widest grasp [m]: the largest distance of two pads that face each other, over random postures."""
     if "span" not in hand.derived:
         draw = torch.rand(5000, hand.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         pads, normals = hand.fingertips(hand.lower + draw.to(hand.lower) * (hand.upper - hand.lower))
@@ -115,17 +117,17 @@ def hand_span(hand: Hand) -> float:
 
 
 def is_vague(shape: ShapeGP) -> bool:
-    """Return whether the deviation somewhere on the surface exceeds half the size of the object."""
+    """Return whether the standard deviation somewhere on the estimated surface exceeds half the object's size."""
     return float(extract_surface(shape, 24).std_m.quantile(0.99)) > shape.scale
 
 
 def order_by_ease(scene: Scene) -> list[int]:
-    """Return the labels of a scene's objects, the easiest first; those whose success no trial supports come last.
+    """Return the labels of a scene's objects, the easiest to grasp first.
 
-    An object is easy if it is tall, has free space around it, and has nothing above it; if the camera is so near that
-    its pixels are smaller than a contact, and sees more of it than fingertips cover; and if its picture is convex, so
-    that it is neither partly hidden nor two objects that touch. No trial supports an object that is larger than those
-    in the trials, or cut off by the border of the image.
+    An object is easy if it is tall, has free space around it, and has nothing above it. The camera should be so near
+    that a pixel on the object is smaller than a contact, and should see more of the object than fingertips cover. The
+    object's outline in the image should be convex; otherwise it may be partly hidden, or be two objects that touch.
+    Objects that are larger than all objects in our trials, or that the image border cuts off, come last.
     """
     from scipy.spatial import ConvexHull, KDTree
 

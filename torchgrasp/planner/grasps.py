@@ -89,12 +89,13 @@ def plan_grasps(
         workers: number of processes for a sequence of clouds; 0 means this process.
         fingers: the fingers that grasp, as in `load_hand`; by default those of `hand`. "auto" chooses, of the sets that
             the hand declares, the one with the greatest expected success. `hand_of` loads the hand of the result.
-        mode: see `Mode`. All modes but "joint" need the hand's learned model, and three fingers.
-        ranking: see `Ranking`; by default "success", in mode "paper" "variance".
+        mode: how hand postures are found, see `Mode`. All modes but "joint" need the hand's learned model, and three
+            fingers.
+        ranking: criterion by which grasps are ordered, see `Ranking`; by default "success", in mode "paper" "variance".
         shape: the object's shape if it is known better than the cloud shows, as after a touch (`ShapeGP.update`).
-        observer: called after each stage with its name, a line of text and its value.
-        reachable: returns as booleans (k,) which poses `obj_from_hand` (k, 4, 4) an arm reaches, in the given frame;
-            by default all poses are reachable.
+        observer: function that is called after each stage with the stage's name, a line of text and its result.
+        reachable: function that returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4) an arm reaches, in
+            the frame of the cloud; by default all poses are reachable.
 
     Returns:
         Grasps: executable grasps (`Status.OK`) first, best first. `explain_empty` explains an empty result.
@@ -152,7 +153,7 @@ def stream_grasps(
 
 
 def _plan(request: Request) -> Grasps:
-    """Return the grasps of all batches, best first, then the failures."""
+    """Plan all batches; return their executable grasps, best first, and then the failed grasps."""
     return _finish(request, list(_plan_batches(request)))
 
 
@@ -175,7 +176,7 @@ def _finish(request: Request, batches: list[Grasps]) -> Grasps:
 
 
 def _plan_batches(request: Request) -> Iterator[Grasps]:
-    """Yield the grasps of each batch in the given frame; several sets of fingers are compared in one batch."""
+    """Yield the grasps of each batch in the frame of the request; several sets of fingers give a single batch."""
     deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
     hands = request.hands
     problem = Problem.of(request, hands[0])
@@ -210,7 +211,7 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
 
 
 def expected_success(grasps: Grasps) -> float:
-    """Return the mean of the `BEST` greatest scores as success, known or not; missing grasps count as failures."""
+    """Return the mean predicted success of the `BEST` best executable grasps; 0 for each grasp that is missing."""
     likely = torch.where(grasps.status == Status.OK, torch.sigmoid(grasps.score), 0.0)
     return float(likely.sort(descending=True).values[:BEST].sum()) / BEST
 
@@ -244,7 +245,7 @@ def _plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]
 
 
 def _plan_or_refuse(request: Request) -> Grasps:
-    """Return the grasps of a request; if the cloud is bad, no grasps and the reason in `meta`."""
+    """Return the grasps of a request; if its cloud is bad, return an empty set with the reason in `meta`."""
     try:
         return _plan(request)
     except MissingExtra:
@@ -281,7 +282,7 @@ def _plan_to_file(cloud: Any, device: str, hand: HandSource, rest: dict[str, Any
 
 
 def _with_arrays(value: Any) -> Any:
-    """Return a dataclass as its class and fields with NumPy arrays, because processes would share tensors."""
+    """Return a dataclass as a pair of its class and its fields, with tensors as NumPy arrays, for another process."""
     if isinstance(value, torch.Tensor):
         return value.detach().cpu().numpy()
     if dataclasses.is_dataclass(value):

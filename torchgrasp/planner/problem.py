@@ -1,4 +1,4 @@
-"""The planning problem: the checked arguments of `plan_grasps`, and what is derived from them in the upright frame."""
+"""The planning problem: the checked arguments of `plan_grasps`, and values derived from them in an upright frame."""
 
 import dataclasses
 import hashlib
@@ -47,11 +47,11 @@ Observer = Callable[[str, str, Any], None]
 
 
 def ignore(stage: str, message: str, value: Any) -> None:
-    """Do nothing: the default observer of planning stages."""
+    """Ignore the report of a planning stage: the observer that is called by default."""
 
 
 class PlanOptions(TypedDict, total=False):
-    """The optional keyword arguments of `plan_grasps`; see there.
+    """The types of the optional keyword arguments of `plan_grasps`, which explains them.
 
     >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
     >>> sorted(options)
@@ -69,7 +69,7 @@ class PlanOptions(TypedDict, total=False):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """The checked arguments of `plan_grasps`; see there."""
+    """The checked arguments of one call of `plan_grasps`, which explains them."""
 
     cloud: PointCloud | Scene
     hand: Hand
@@ -86,7 +86,7 @@ class Request:
 
     @property
     def contact_spec(self) -> ContactSpec:
-        """The given constraints on contacts, or the default of the mode."""
+        """The given constraints on contacts; if none are given, the default constraints of the planning mode."""
         if self.spec is not None:
             return self.spec
         return ContactSpec.paper() if self.mode == "paper" else ContactSpec()
@@ -103,7 +103,9 @@ class Request:
 
 
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
-    """Return one hand for each set of fingers to plan: its own, the named set, or with "auto" all declared sets.
+    """Return one hand for each set of fingers to plan with.
+
+    "auto" gives all sets that the hand declares; a name or number gives that set; None gives the hand as it is.
 
     Raises:
         BadArgument: fingers that the hand does not have; more than three fingers, or "auto", in a mode other than
@@ -143,7 +145,7 @@ class Problem:
 
     @classmethod
     def of(cls, request: Request, hand: Hand) -> "Problem":
-        """Find the object, its upright frame and its shape; return the problem."""
+        """Find the object of a request, its upright frame and its shape; return the planning problem of the hand."""
         cloud, spec, scene = request.cloud, request.contact_spec, None
         if isinstance(cloud, Scene):
             scene, cloud = cloud, take_target(cloud, request.seed)
@@ -171,7 +173,7 @@ class Problem:
 
     @cached_property
     def flat(self) -> Settled:
-        """The contact constraints with a chosen radius of flatness, and the candidate contacts on flat surface."""
+        """The contact constraints, with the radius on which a contact must be flat, and the flat candidate contacts."""
         spec = dataclasses.replace(self.given_spec, table=None if self.given_spec.table is None else 0.0)
         tips = self.hand.tips
         spec = dataclasses.replace(spec.for_fingertips(float(tips.radius.max())), fingertips=len(tips))
@@ -179,7 +181,7 @@ class Problem:
 
     @property
     def spec(self) -> ContactSpec:
-        """The constraints on contacts for this hand."""
+        """The constraints on contacts for the fingertips of this hand, in the upright frame."""
         return self.flat.spec
 
     @cached_property
@@ -194,13 +196,13 @@ class Problem:
 
     @cached_property
     def cut(self) -> bool:
-        """Whether the border of an image cuts the object off."""
+        """Whether the object is only partly in the camera's image, cut off by the image border."""
         cloud = self.cloud
         return cloud.frustum is not None and cloud.viewpoint is not None and silhouettes(cloud.to("cpu")).cut
 
     @cached_property
     def obstacles(self) -> Obstacles | None:
-        """The obstacles around the target of a scene; None without a scene."""
+        """The obstacles around the target of a scene, or None if the request has no scene."""
         scene = self.scene
         if scene is None or scene.target is None:
             return None
@@ -216,12 +218,12 @@ class Problem:
 
     @cached_property
     def library(self) -> PostureLibrary:
-        """The library of random postures of the hand."""
+        """Random postures of the hand, from which initial postures near contacts are chosen."""
         return PostureLibrary.of(self.hand, seed=self.request.seed)
 
     @cached_property
     def buried(self) -> bool:
-        """Whether the object cannot be lifted free: rising, it runs into obstacles, over 3 mm deeper than at rest."""
+        """Whether obstacles prevent lifting: the rising object would enter them over 3 mm deeper than at rest."""
         if self.obstacles is None or not self.obstacles.hard:
             return False
         standing = float(self.obstacles.field.query(self.surface.vertices)[0].min())
@@ -243,7 +245,7 @@ class Problem:
             self.request.observer(stage, message, self._moved(value))
 
     def give_back(self, grasps: Grasps) -> Grasps:
-        """Return grasps in the caller's frame, with frames, units and provenance as metadata."""
+        """Return grasps in the caller's frame; their metadata name the frames, units and inputs of the plan."""
         hand, spec, request = self.hand, self.given_spec, self.request
         meta = {
             "hand": hand.name,
@@ -264,7 +266,7 @@ class Problem:
         return dataclasses.replace(self._moved(grasps), meta=grasps.meta | meta)
 
     def _moved(self, value: Any) -> Any:
-        """Return a value, converted to the caller's frame."""
+        """Return a value of any type, converted from the upright frame to the caller's frame."""
         frame = self.obj_from_upright
         return value.moved(frame) if isinstance(value, ShapeGP) else move(value, frame)
 

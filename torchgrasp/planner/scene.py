@@ -28,8 +28,9 @@ from torchgrasp.values import Grasps
 class ThingPlan(Value):
     """The executable grasps of one object in a scene, best first, or the reason why there are none.
 
-    `success` is predicted for the best grasp: 0 without grasps, NaN if it is unknown. `shape` is the estimated shape.
-    `status` names what the picture shows against the object; then nothing was planned.
+    `success` is the predicted probability that the best grasp succeeds: 0 without grasps, NaN if it is unknown.
+    `shape` is the estimated shape. If the image shows that the object cannot be grasped, `status` is the reason, and
+    nothing was planned.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
@@ -78,9 +79,9 @@ def plan_scene(
 ) -> ScenePlan:
     """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
-    Objects that the hand cannot grasp by what the picture shows are not planned (`Status.FEW_PIXELS` to `TOO_VAGUE`).
-    Of the others, near and tall objects with free space around them are planned first, and objects whose success no
-    trial supports last.
+    Nothing is planned for an object that the hand cannot grasp as its image shows (`Status.FEW_PIXELS` to `TOO_VAGUE`).
+    Of the other objects, near and tall ones with free space around them are planned first. Objects that are larger than
+    all objects in our trials, or cut off by the image border, are planned last.
 
     Args:
         scene: objects on a table.
@@ -120,13 +121,13 @@ def plan_scene(
 
 
 def _order(thing: ThingPlan) -> tuple[bool, bool, float]:
-    """Return the key of the order of objects: of known success, of unknown success (NaN), then without a grasp."""
+    """Return a key for sorting: known success (highest first), then unknown success (NaN), then no grasp."""
     unknown = math.isnan(thing.success)
     return thing.grasps is None, unknown, 0.0 if unknown else -thing.success
 
 
 def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
-    """Plan grasps of a scene's target object."""
+    """Plan grasps of a scene's target object with the function `plan`; without a grasp, return the reason."""
     assert scene.target is not None
     stages: dict[str, Any] = {}
 
