@@ -204,8 +204,8 @@ class SensorModel(Value):
     """The sensors of a hand's fingertips: kind, delay, noise and dead sensors. `FingertipSensor` simulates them.
 
     Args:
-        kind: "tactile": force, position and sliding of each contact, like a BioTac. "torque": only the force, from the
-            torques of the finger's joints. "binary": only whether the fingertip touches.
+        kind: what they measure. "tactile": force, position and sliding of each contact, like a BioTac. "torque": only
+            the force, from the torques of the finger's joints. "binary": only whether the fingertip touches.
         delay: age [s] of the readings, in whole samples of the sensor.
         noise: factor on the usual noise.
         dead: names of the fingers whose sensor is known to be broken.

@@ -126,7 +126,7 @@ Mode = Literal["joint", "contact_first", "paper"]
   shape, contacts and ranking.
 """
 Ranking = Literal["success", "variance"]
-"""The best grasp: that of the highest predicted success, or of the least sum of variances as in the paper."""
+"""Which grasp is the best: the one with the highest predicted success, or the least sum of variances (the paper's)."""
 
 ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper", "uncertainty"]
 """How a hand closes, see `TrialSpec`."""
@@ -142,8 +142,8 @@ class TrialSpec(Value):
 
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
-            "uncertainty": the same control law with further components (`ClosingOptions`). "fixed": as "uncertainty"
-            with equal gains. "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
+            "uncertainty": the same control law with further components (`ClosingOptions`). "fixed": "uncertainty" with
+            equal gains. "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
             "position": PI control to goals behind the contacts. "open_loop": joint motion from pre-grasp to grasp to
             squeeze.
         holding: how the closed hand presses: "force" (balanced forces), "grip" (least forces for the felt load),

@@ -176,7 +176,7 @@ def _read_forms(value: object) -> tuple[Any, list[float] | None, float | None, l
 
 
 def _window(named: Mapping[str, Any]) -> list[float]:
-    """Return corner, width and height of ROS's region of interest [px], and its binning; 0: all of the image, or 1."""
+    """Return corner, width and height of ROS's region of interest [px] (0 for the whole image), and its binning."""
     roi, sides = named.get("roi", {}), ("x_offset", "y_offset", "width", "height")
     found: list[Any] = [roi.get(side, 0) if isinstance(roi, Mapping) else getattr(roi, side, 0) for side in sides]
     found += [named.get("binning_x", 0), named.get("binning_y", 0)]

@@ -18,7 +18,7 @@ def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
 def nearest(
     points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
-    """Return distances and indices of the k points nearest to each of `rows`, by default of all points, itself first.
+    """Return distances and indices of the k points nearest to each point of `rows` (by default all), itself first.
 
     A small cloud has fewer neighbours.
     """

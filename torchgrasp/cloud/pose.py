@@ -31,7 +31,7 @@ def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
 
 
 def _describe_fault(pose: Float[Tensor, "4 4"]) -> str:
-    """Say why a matrix is no rigid transform, and what mends it."""
+    """Return why a matrix is not a rigid transform, and what would mend it."""
     if bool(pose[3, :3].any()) and not bool(pose[:3, 3].any()):
         return ", a transposed pose: give its transpose"
     length, side = torch.linalg.vector_norm(pose[:3, :3], dim=0), torch.linalg.det(pose[:3, :3])

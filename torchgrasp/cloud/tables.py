@@ -33,7 +33,7 @@ def parse_npy(data: bytes) -> np.ndarray:
 
 
 def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str, np.ndarray]:
-    """Return the arrays of these names in a .npz file; of any name, where no name is given.
+    """Return the arrays of these names in a .npz file, or all arrays if no name is given.
 
     Raises:
         ValueError: no array of the `required` name, arrays that are too large unpacked, or what `parse_npy` refuses.
@@ -105,11 +105,11 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
 
 
 def read_image(name: str, path: Path | str) -> Any:
-    """Return the numbers of an image file: .npy, .npz, .png, .tiff; of depth .exr, of masks .json.
+    """Return the numbers of an image file: .npy, .npz, .png or .tiff; for depth also .exr, for masks also .json.
 
     Args:
-        name: in errors: "depth", which is one channel and an array of this name; or "mask", which may be a picture, or
-            several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
+        name: what the file holds, named in errors. "depth" has one channel and an array of this name. "mask" may be a
+            picture, or several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
         path: the file.
 
     Raises:

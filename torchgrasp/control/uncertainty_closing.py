@@ -126,7 +126,7 @@ class UncertaintyClosing:
     def _desired(
         self, reading: Float[Tensor, "f"], contact: Bool[Tensor, "f"], rests: Bool[Tensor, "f"]
     ) -> Float[Tensor, "f"]:
-        """Return the desired normal force [N] of each finger; without a sensor the force error is zero."""
+        """Return the desired normal force [N] of each finger. If its sensor is dead, the force error is zero."""
         desired = -(self.reference.gains.desired_force * self.reference.normals).sum(-1)
         if self.waits:
             rest = WAITING_FORCE if bool(contact.all()) else reading.clamp_max(WAITING_FORCE)

@@ -236,7 +236,7 @@ def _file(objects: Path | str, name: str, file: str) -> Path:
 
 
 def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
-    """Return the manifest's entries of the objects in `only`; of all objects if `only` is empty."""
+    """Return the manifest's entries of the objects in `only`, or of all objects if `only` is empty."""
 
     def refuse(found: str, allowed: str) -> DatasetError:
         return DatasetError("objects", found, allowed)

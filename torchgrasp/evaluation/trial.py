@@ -57,8 +57,8 @@ class TrialDriver:
 
     Attributes:
         reference: the closing plan; by default derived from the trial's hand and grasp.
-        obj_from_world: pose of the simulator's frame in the grasp's frame; with a table the frame is upright on the
-            table. Poses in the simulator's frame are rounded, so that results are bitwise invariant to rigid motion.
+        obj_from_world: pose of the simulator's frame in the grasp's frame. If there is a table, the frame is upright
+            on it. Poses in the simulator's frame are rounded, so that results are bitwise invariant to rigid motion.
 
     Raises:
         BadArgument, MeshError: as in `close_hand`.

@@ -44,10 +44,10 @@ class EvaluationSpec(Value):
 
     Args:
         grasps: largest number of grasps to try for each view.
-        ranks: "best": the best grasps; "spread": grasps spread evenly over all ranks.
+        ranks: "best" tries the best grasps, "spread" tries grasps spread evenly over all ranks.
         starts: number of initial guesses of the contact planner.
         complete: plan on whole clouds with normals, as if the shape were known.
-        only: names of objects; (): all objects.
+        only: names of objects; by default all objects.
         planned: use the grasps that an earlier call saved, instead of planning.
         seed: random seed.
         views: largest number of views of each object; None means all views.

@@ -153,7 +153,7 @@ def load_tensors(
 def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) -> tuple[SomeValue, dict[str, str]]:
     """Read a value and metadata from a safetensors file of a `kind`; raise `ModelFileError` for other shapes or types.
 
-    The annotations of the fields name the tensors. `rest` gives fields that are no tensors; others keep their defaults.
+    The annotations of the fields name the tensors. `rest` gives the other fields, unless they keep their defaults.
     """
     fields = _tensor_fields(of)
     optional = {name for name, kinds in fields.items() if type(None) in kinds}

@@ -82,7 +82,7 @@ def farthest_points(
         points: vectors, or any values that `distance` compares.
         count: the number of points.
         first: index of the first point.
-        tie: relative difference up to which distances count as equal; of equally far points the first is taken.
+        tie: relative difference up to which distances count as equal. The first of equally far points is taken.
         distance: function that returns the distance of each point from a single point; Euclidean by default.
         before: points that count as already picked and are not returned; `first` is then not used.
     """

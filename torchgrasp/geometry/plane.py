@@ -92,10 +92,10 @@ def upright_frame(
 ) -> Float[Tensor, "4 4"]:
     """Return `obj_from_upright`: the pose of a frame that is fixed to points, camera and table.
 
-    The z axis is the table's normal; without table the direction to the camera; without both the least principal axis
-    of the points. The x axis is horizontal and points towards the camera. If the camera is straight above, x points to
-    the point farthest from the vertical through the points' centroid. The origin is on this vertical, on the table if
-    there is one.
+    The z axis is the table's normal. If there is no table, it points to the camera; if there is no camera either, it is
+    the least principal axis of the points. The x axis is horizontal and points towards the camera. If the camera is
+    straight above, x points to the point farthest from the vertical through the points' centroid. The origin is on this
+    vertical, on the table if there is one.
 
     Raises:
         BadArgument: most points are below the table.

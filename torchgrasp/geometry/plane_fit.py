@@ -17,7 +17,7 @@ MOST_TILT = 30.0  # greatest angle [deg] between the normal and `up`
 
 
 def assume_noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -> Float[Tensor, "n"]:
-    """Return the assumed noise [m] of each point; without a camera that of 0.7 m distance."""
+    """Return the assumed noise [m] of each point. If the camera is unknown, its distance is taken as 0.7 m."""
     squared = torch.full((len(points),), 0.7**2, dtype=points.dtype)
     return NOISE + NOISE_GROWTH * (squared if eye is None else (points - eye).square().sum(-1))
 

@@ -254,7 +254,7 @@ def _ordered(found: list[_Candidate]) -> list[_Candidate]:
 
 
 def _judge(view: View, fit: PlaneFit, least_width: float) -> _Candidate | str:
-    """Return a plane as a candidate, or why it is no support."""
+    """Return a plane as a candidate, or the reason why it is not a support."""
     points, height = view.points, view.points @ fit.normal - fit.offset
     tolerance = 4 * fit.scale * view.noise + 0.001
     share = fit.count / len(points)

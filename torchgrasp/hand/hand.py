@@ -232,7 +232,7 @@ class Hand(Value):
         below: Annotated[float, Range(-math.inf, math.inf)] = math.inf,
         chunk: Count = 1000,
     ) -> Float[Tensor, "*b"]:
-        """Return the least signed separation [m] of the link pairs that hand.toml lists; negative: links overlap.
+        """Return the least signed separation [m] of the link pairs in hand.toml. It is negative if links overlap.
 
         A negative value is minus the shortest translation that separates two links. A positive value is a lower bound
         of the distance, exact where a face is nearest.

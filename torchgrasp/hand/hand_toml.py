@@ -177,7 +177,7 @@ def _is_graspable(names: tuple[str, ...], known: Collection[str]) -> bool:
 def _choose(
     options: dict[str, Option], known: dict[str, Finger], coupling: dict[str, Mimic], wanted: Fingers
 ) -> tuple[str, Option]:
-    """Return name and content of the option for the wanted fingers; without an option the name lists the fingers."""
+    """Return name and content of the option for the wanted fingers. If none is declared, the name lists the fingers."""
     declared = f"one of the options {sorted(options)}, their number of fingers, or {SUPPORTED} of {sorted(known)}"
     if isinstance(wanted, str) and wanted in options:
         return wanted, options[wanted]

@@ -174,7 +174,7 @@ class CobylaRun:
         return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.contact)[..., 0].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of tip distances from contacts [mm], and the constraints >= 0: clearances less 0.5 mm."""
+        """Return the sum of tip distances from contacts [mm], and the clearances less 0.5 mm, which must be >= 0."""
         key = np.asarray(x).tobytes()
         if self.last is None or self.last[0] != key:
             _, frames, pose, framed = self.place(x)
@@ -184,7 +184,7 @@ class CobylaRun:
         return self.last[1:]
 
     def clearances(self, frames: Float[Tensor, "3 4 l 1"], pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, ""]]:
-        """Return clearances [m]: between links; of palm, fingers and tips from the object; from table and obstacles."""
+        """Return clearances [m] between links, of palm, fingers and tips from the object, from table and obstacles."""
         spheres, radius = self.hand.collision_spheres, self.hand.collision_spheres.radius.to(pose)
         local = map_points(frames.index_select(2, spheres.link_index), spheres.center)[..., 0].T
         centres = apply(pose, local)

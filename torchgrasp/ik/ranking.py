@@ -63,7 +63,7 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
 
 
 def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
-    """Return the geometric score, at most 0: distance from the centre, friction needed, and angle off the pads."""
+    """Return minus a weighted sum of distance from the centre, friction needed, and angle between pad and contact."""
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(offset / 0.02 + centred_friction(contacts) + normal_angle.amax(1) / 0.8)
 
@@ -71,7 +71,7 @@ def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[
 def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
     """Return the lever arm of a load at `center` about the longest side of the contacts' triangle, over its height.
 
-    The object turns most easily about this side. For more than three contacts the best three count.
+    The object turns most easily about this side. If there are more than three contacts, the best three count.
     """
     if points.shape[1] > 3:
         triples = torch.tensor(list(itertools.combinations(range(points.shape[1]), 3)), device=points.device)
@@ -120,7 +120,7 @@ def _read_model() -> dict[str, Any]:
 
 
 def success_log_odds(features: Float[Tensor, "g k"], hand: str) -> Float[Tensor, "g"]:
-    """Return the log-odds of success of grasps with a hand, by name; an untried hand gets the least bias of all."""
+    """Return the log-odds of success of grasps with the named hand. A hand without trials gets the least bias."""
     model = _read_model()
     bias = model["bias"].get(hand, min(model["bias"].values()))
     return features @ features.new_tensor([model["weights"][name] for name in FEATURES]) + bias

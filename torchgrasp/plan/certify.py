@@ -1,7 +1,7 @@
 """Certificates of frictional form closure, Eq. (13): for each contact set a verdict, with a proof.
 
-Coefficients phi that balance all wrenches prove closure, and bound the margin from below. A witness, a direction that
-no contact wrench opposes, disproves closure, and bounds the margin from above. A batched simplex method (`closure`)
+Coefficients phi that balance all wrenches prove closure, and bound the margin from below. A witness, which is a wrench
+that no contact opposes, disproves closure, and bounds the margin from above. A batched simplex method (`closure`)
 finds both. HiGHS decides where the two bounds leave the verdict open.
 """
 
@@ -73,7 +73,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
 
 def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
-    """Return margin, residual and witness of each wrench matrix; HiGHS decides what the simplex method leaves open."""
+    """Return margin, residual and witness of each wrench matrix, by our simplex method, or by HiGHS where it fails."""
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
     margin, upper = phi.amin(-1), bound_margin(wrench, witness)

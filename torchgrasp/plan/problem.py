@@ -244,7 +244,7 @@ class ContactProblem:
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:
-    """Return the Jacobian by all unknowns of values that each depend on their own contact point only."""
+    """Return the Jacobian of values, each of which depends only on its own contact, with respect to all unknowns."""
     b, f = slope.shape[:2]
     jacobian, at = slope.new_zeros(b, f, unknowns), torch.arange(f, device=slope.device)
     jacobian[:, :, : 3 * f].unflatten(2, (f, 3))[:, at, at] = slope

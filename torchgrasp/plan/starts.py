@@ -65,8 +65,8 @@ class Settled(NamedTuple):
 def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
     """Yield random initial guesses on the surface in normalised units, `sizes[k]` at a time.
 
-    Without `spec.flatness` they are the paper's (Sec. 6.2); with flatness they are sets of candidate contacts, because
-    the centroid of a flat grasp may lie far from the object's centre.
+    Without `spec.flatness` they are drawn as in the paper (Sec. 6.2). With it they are sets of candidate contacts,
+    because the centroid of contacts on flat surface may lie far from the object's centre.
     """
     (spec, candidates), generator = settled, torch.Generator().manual_seed(seed)
     if candidates is not None:
@@ -82,8 +82,7 @@ def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int
 def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
     """Choose the largest `flat_radius` at which enough guesses have force closure, if none is given.
 
-    The candidates are the points at which the surface is flat.
-    If too few points are flat, all points of `survey` are candidates.
+    The candidates are the points at which the surface is flat, or all points of `survey` if too few are flat.
     """
     if spec.flatness is None:
         return Settled(spec, None)

@@ -68,7 +68,7 @@ class Components(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Progress(Value):
-    """The state of a fit; with the data it determines the next step.
+    """The state of a fit. The state and the data determine the next step.
 
     `reseeded` counts how often each component collapsed and was placed anew; the likelihood may fall after that.
     `log_likelihood` [nats] is the mean over the data before each step.

@@ -78,8 +78,8 @@ MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's mil
 Sampling = Literal["uniform", "grasping"]
 """Which free postures are taken.
 
-* "uniform": all, as in the paper; they touch with the middle of their pads.
-* "grasping": those that can hold something where their tips have rolled, as what is planned for them does.
+* "uniform": all postures are taken, as in the paper. Their fingertips touch with the middle of their pads.
+* "grasping": postures are taken whose contacts, where the rolled fingertips touch, can have force closure.
 """
 
 

@@ -20,7 +20,7 @@ MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a 
 
 
 def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> Int[Tensor, "..."]:
-    """Return checked labels of the depth's or the cloud's shape: whole numbers >= 0, where 0 is no object.
+    """Return checked labels of the depth's or the cloud's shape: whole numbers >= 0, where 0 means no object.
 
     Args:
         labels: numbers of the shape, of any type, or with one channel more; a picture (h, w, 3 or 4) with a colour for

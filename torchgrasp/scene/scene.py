@@ -31,7 +31,7 @@ class Scene(Value):
 
     Args:
         points: every measured point [m].
-        labels: 0 for the table and all that is no object; 1, 2, ... for the objects.
+        labels: 1, 2, ... for the objects, 0 for the table and everything else.
         image: what the camera measured: it shows free space and hidden space.
         pixels: row and column of each point in the image.
         table: the plane that the objects stand on, or None if it is unknown.
@@ -81,9 +81,9 @@ class Scene(Value):
             intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth` takes.
             camera_pose: obj_from_camera (4, 4), rigid; without it results are in the camera's frame.
             mask: (h, w), not 0 at the target, which may be off by a few pixels; or in another form of `labels`.
-            labels: (h, w) of whole numbers, 0 is no object; a picture with a colour for each object; a list of masks;
-                or COCO's run lengths.
-            point: of the target: a pixel (u, v), or a point (x, y, z) [m].
+            labels: (h, w) of whole numbers, where 0 means no object; a picture with a colour for each object; a list of
+                masks; or COCO's run lengths.
+            point: a place on the target, as a pixel (u, v) or a point (x, y, z) [m].
             table: a plane, or its height z [m]; by default it is fitted.
             up: (3,), against gravity, for the fit; None allows any direction.
             depth_unit: metres of one count of the depth, as `cloud_from_depth` takes it.
@@ -126,7 +126,7 @@ class Scene(Value):
 
         Args:
             cloud: everything that the camera saw [m], with its viewpoint.
-            labels: (n,) of whole numbers; 0 is no object.
+            labels: (n,) of whole numbers; 0 means no object.
             mask: (n,) of bool, points of the target.
             box: two corners (2, 3) [m] of a box along the axes, which holds the target.
             point: a point (x, y, z) [m] of the target.

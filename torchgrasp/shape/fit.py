@@ -73,7 +73,7 @@ def fit_shape(
         cloud: points [m] of one object, of one view or of several (`merge_clouds`), prepared by `prepare_cloud`. Given
             normals distinguish a whole surface from a view. Walls thinner than the cloud's spacing merge, but an open
             vessel seen from above on a `table` has two walls (`HollowShape`).
-        noise: standard deviation of an observed signed distance, normalised; with "paper" also of a normal.
+        noise: standard deviation of an observed signed distance, normalised. If `support` is "paper", also of a normal.
         budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. The default
             is 85 for "camera", outline and mirrored points not counted, and 70 for "paper". "sure" adds points until no
             point's variance exceeds `noise`, the paper's rule, at most 1000.

@@ -81,9 +81,10 @@ def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
 
 
 def camera_support(seen: PreparedCloud, completion: Completion | None, noise: float, table: float | None) -> Support:
-    """Return supporting observations at metric distances; of a view (`completion`) also its hidden side and free space.
+    """Return observations at metric distances that support the fit.
 
-    `noise` is that of the distance observed inside, normalised; `table` is the table's height [m].
+    If the cloud is a view with a `completion`, they include its hidden side and free space. `noise` is that of the
+    distance observed inside, normalised; `table` is the table's height [m].
     """
     hidden = seen.points[:0] if completion is None else completion.points.to(seen.points)
     surface = torch.cat([seen.points, hidden])

@@ -76,7 +76,7 @@ class Settled:
         period: float,
         pressing: bool = True,
     ) -> None:
-        """Update the time by one tick; without `pressing` it is enough that all fingers touch."""
+        """Update the time by one tick: all fingers must touch and, with `pressing`, press steadily."""
         average = observation.tactile.average
         settled = bool(touching.all())
         if pressing:
@@ -97,7 +97,8 @@ def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
 class PositionClosing:
     """The paper's baseline (Table 7): a PI position controller for each fingertip, stopped at `STOP_FORCE`.
 
-    The goal lies `depth` [m] behind the planned contact. The paper's depth is 0: a finger may stop before it touches.
+    The goal lies `depth` [m] behind the planned contact. With the paper's depth of 0 a finger may stop before it
+    touches.
     """
 
     palm = STILL
