@@ -36,8 +36,8 @@ def look_at(
 
     Args:
         azimuth: direction of the camera, from x towards y [deg].
-        elevation: above the horizontal [deg], in [-89.9, 89.9].
-        distance: from the target [m], in [0.01, 10].
+        elevation: its angle above the horizontal [deg], in [-89.9, 89.9].
+        distance: distance of the camera from the target [m], in [0.01, 10].
         target: point (3,) [m] in the middle of the image, or a mesh, for the centre of its box; by default the origin.
 
     Raises:
@@ -75,11 +75,11 @@ def partial_view(
     missing pixels at rims, and surfaces that fade out at grazing angles.
 
     Args:
-        mesh: in the object frame [m].
+        mesh: the object's mesh in its own frame [m].
         camera_pose: obj_from_camera, see `look_at`.
         n: points drawn from the pixels; all pixels if there are fewer.
         noise: the name of a camera, or its `SensorNoise`; False gives exact depths.
-        seed: of noise and choice of points.
+        seed: random seed of the noise and of the choice of points.
 
     Raises:
         BadArgument: fewer than 4 points; a pose that is not rigid.
@@ -152,11 +152,11 @@ def render_depth(
     of radius 0.6 m about the origin.
 
     Args:
-        meshes: in the world frame [m].
+        meshes: the objects' meshes in the world frame [m].
         camera_pose: world_from_camera, see `look_at`.
         table: height z of the table [m]; None means no table.
         noise: as in `partial_view`.
-        seed: of the noise.
+        seed: random seed of the noise.
 
     Raises:
         BadArgument: a pose that is not rigid.

@@ -65,7 +65,7 @@ def read_cloud(
     Args:
         path: the file.
         viewpoint: the camera's position (3,) [m] in the cloud's frame, instead of the file's.
-        unit: of the file's points and viewpoint.
+        unit: unit of the file's points and viewpoint.
 
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5 million points.
@@ -125,7 +125,7 @@ def cloud_from_array(
 
     Args:
         points: (n, 3), (h, w, 3) of an image, or with three more columns of normals.
-        normals: of the same shape as points, or None.
+        normals: normals of the points, in the same shape, or None.
         viewpoint: the camera (3,), or None.
 
     Raises:

@@ -28,8 +28,8 @@ def guess_viewpoint(
     preferred if the view is in front of it and it can have been the camera. 180 degrees: the points hardly tell.
 
     Args:
-        points: of a view [m], without outliers.
-        normals: of unit length and any sign.
+        points: points of a view [m], without outliers.
+        normals: their normals, of unit length and any sign.
         up: a direction above the support; the normal of a support in the points counts more.
         assumed: whether `up` is assumed, so that the cloud may be in its camera's frame instead.
     """

@@ -92,7 +92,7 @@ def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
 
 
 def load_shard(path: Path, meta: dict[str, str]) -> Shard:
-    """Read a shard file; raise `ModelFileError` if it is missing or damaged, or has not the metadata `meta`."""
+    """Read a shard file; raise `ModelFileError` if it is missing or damaged, or its metadata differs from `meta`."""
     records, found = read_value(path, KIND, Records)
     if (other := {key: found.get(key) for key in meta}) != meta:
         raise ModelFileError("path", f"{path} of {other}", f"a shard of {meta}")

@@ -103,8 +103,8 @@ def find_supports(
         points: everything that was seen [m].
         viewpoint: the camera's position [m], on the upper side. If it is None, the side with more points is upper.
         up: vector against gravity, of any length; None allows any direction.
-        seed: of the draws.
-        least_width: of the region of a support [m].
+        seed: random seed of the draws.
+        least_width: least width of the region of a support [m].
 
     Raises:
         BadArgument: a wrong shape or type, or points that are not finite.

@@ -149,7 +149,7 @@ def candidate_rows(
 ) -> tuple[Vectors, int]:
     """Return random sets of candidate contacts, and how many of them have force closure and are well separated.
 
-    Sets that have not are returned only if too few of the drawn sets have.
+    If too few of the drawn sets are such, the rest are any candidates.
     """
     rows, missing, f = [], starts, problem.fingertips
     for _ in range(ROUNDS):

@@ -27,8 +27,8 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
             each object, where black and transparent are none; a list of masks, where the smaller lies above the larger;
             a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its "segmentation"; or a dict
             with a list of "annotations".
-        shape: of the depth (h, w), or of the cloud (n,).
-        name: of the argument, in errors.
+        shape: shape of the depth (h, w), or of the cloud (n,).
+        name: name of the argument, for errors.
 
     Raises:
         BadArgument: another shape, negative or broken numbers, run lengths of another size, or over 1000 values.

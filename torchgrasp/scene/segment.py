@@ -171,9 +171,9 @@ def _is_noise(labels: Int[Tensor, "h w"], k: int, image: DepthImage, deviations:
     """Return whether a small object is an uneven place of the table, or a fringe of a body ten times as large.
 
     Args:
-        labels: of the objects.
+        labels: labels of the objects.
         k: label of the small object.
-        image: of the objects.
+        image: the depth image of the objects.
         deviations: heights above the table over the deviation of the noise, with shape (h, w).
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt

@@ -59,7 +59,7 @@ class _DepthCommand(Command):
         return ViewOptions(**given).vertical
 
     def images(self):
-        """Return the depth image, the intrinsics, labels of the mask and the camera pose; None where not given."""
+        """Return the depth image, the intrinsics, mask labels and camera pose; what is not given is None."""
         if self.depth_unit is not None and not 0 < self.depth_unit <= 1:
             raise BadArgument("--depth-unit", self.depth_unit, "metres of one count, above 0 and at most 1")
         camera = self.intrinsics
