@@ -161,11 +161,12 @@ class ContactPlan(Batch):
 class Certificate(Batch):
     """The proof that contact sets have frictional form closure (Eq. 13), or that they have not; see `certify`.
 
-    `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio` is the smallest over the largest
-    singular value of W, torques divided by the radius of the contacts. `residual` is the largest |W phi|. `closed`,
-    which means force closure, needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13)
-    too. `witness` is a unit wrench w with w . v >= -margin for every wrench v along an edge of a friction cone. If the
-    contacts have no force closure, no contact force opposes w.
+    The columns of W are the wrenches along the edges of the friction cones, with torques divided by the radius of the
+    contacts; phi are their coefficients. `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio`
+    is the smallest over the largest singular value of W. `residual` is the largest |W phi|. `closed`, which means force
+    closure, needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13) too. `witness` is
+    a unit wrench w with w . v >= -margin for every column v of W. If the contacts have no force closure, no contact
+    force opposes w.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]

@@ -247,7 +247,7 @@ def _corrected(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Flo
 def most_opposing(
     points: Vectors, normals: Vectors, friction: float, witness: Float[Tensor, "b 6"]
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 6"]]:
-    """Return the wrench in each contact's round friction cone that is most opposed to the witness, and their product.
+    """Return the least product of the witness with a wrench in each contact's round friction cone, and that wrench.
 
     A witness is a wrench that disproves force closure: its products with all contact wrenches are at least 0.
     """
