@@ -1,4 +1,4 @@
-"""What is wrong with a cloud, what is right instead, and the command that fixes it."""
+"""Advice on a point cloud: each fault that was found, with the command that fixes it."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ FEWEST = 50  # fewest points that show whether a camera is right, or whether pix
 
 @dataclasses.dataclass(frozen=True)
 class Advice(Value):
-    """Something wrong with a cloud: what was found, what is right with its command, and whether it forbids a grasp.
+    """A fault of a point cloud: the fault `found`, its `fix`, and whether planning is `refused` because of it.
 
     >>> print(Advice("the cloud is empty", "look again", refused=True))
     the cloud is empty: look again
@@ -41,13 +41,13 @@ class Advice(Value):
 def judge_view(
     cloud: PointCloud, clean: PointCloud, up: Float[Tensor, "3"], table: Plane | None, stands: bool = True
 ) -> list[Advice]:
-    """Return what contradicts a cloud's viewpoint, vertical and table, the worst first.
+    """Return advice on a cloud's camera, vertical and table, and on other bodies left in; refusals come first.
 
     Args:
         cloud: distinct points [m], with the given normals and viewpoint, if any.
         clean: the same cloud cleaned, with outward normals and perhaps an estimated viewpoint.
-        up: the vertical, of unit length.
-        table: the table; None means one at the lowest point.
+        up: unit vector that points up.
+        table: plane of the table; None if the table is assumed at the lowest point.
         stands: whether the object stands on a table.
     """
     assert clean.normals is not None
@@ -89,7 +89,7 @@ def judge_view(
 def _find_support(
     points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None, up: Float[Tensor, "3"]
 ) -> tuple[Plane, float] | None:
-    """Return a support that was left in, even a narrow one, and its share of the points; a camera shows any tilt."""
+    """Return the plane of a table that was left in the cloud, and its share of the points; None if there is none."""
     for sky, width in ((up, 0.06), *([(None, LEAST_WIDTH)] if eye is not None else [])):
         try:
             plane = find_supports(points, eye, sky, least_width=width)[0].plane
@@ -100,7 +100,7 @@ def _find_support(
 
 
 def _judge_facing(facing: float) -> list[Advice]:
-    """Judge the share of given normals that face the given camera: a view has nearly 1, a whole surface half."""
+    """Return advice if too few normals face the camera: nearly all do in a single view, half on a whole surface."""
     if facing < 1 - FACING:
         fix = "outward normals, or none (--no-normals), or the true --viewpoint X Y Z"
         return [Advice(f"normals of which {1 - facing:.0%} point away from the camera", fix, True)]
@@ -111,7 +111,7 @@ def _judge_facing(facing: float) -> list[Advice]:
 
 
 def _judge_camera(clean: PointCloud, given: bool) -> list[Advice]:
-    """Judge whether the camera of each view can have seen its points."""
+    """Return advice if a camera, `given` by the user or else estimated, cannot have seen the points of its view."""
     worst = (0.0, 0.0)
     for view in clean.split_views():
         if view.viewpoint is not None and view.normals is not None and len(view) >= FEWEST:
@@ -138,7 +138,7 @@ def _judge_height(
     table: Plane | None,
     support: tuple[Plane, float] | None,
 ) -> list[Advice]:
-    """Judge whether the camera is above the table."""
+    """Return advice if the camera is below the table, or below the lowest point if the table is unknown."""
     lowest = float((points @ up).min()) if table is None else table.offset
     normal = up if table is None else table.normal.double()
     below = lowest - float((eye @ normal).min())
@@ -164,14 +164,14 @@ def _judge_height(
 
 
 def _describe_support(plane: Plane, share: float, up: Float[Tensor, "3"]) -> Advice:
-    """Describe the table that was left in the cloud."""
+    """Return the advice to cut off a table, the plane with this share of the cloud's points."""
     turn = f" --up {_triple(plane.normal, ' ')}, its normal," if float(plane.normal @ up) < 0.97 else ""
     found = f"a plane under the object, a table left in, with {share:.0%} of the points"
     return Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True)
 
 
 def judge_pixels(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> list[Advice]:
-    """Judge whether pixels fly off rims: outliers that lie behind or before other points on their rays."""
+    """Return advice if many outliers are flying pixels: they lie before or behind other points on camera rays."""
     points = cloud.points.double()
     inlier = find_inliers(points)
     if bool(inlier.all()) or int(inlier.sum()) < FEWEST:
@@ -190,6 +190,6 @@ def judge_pixels(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> list[Advic
 
 
 def _triple(vector: Tensor, between: str = ", ") -> str:
-    """Return three numbers for a sentence or for a command."""
+    """Return three numbers as text: in brackets with commas, or separated by spaces for a command line."""
     numbers = between.join(f"{0.0 + round(x, 3):g}" for x in vector.tolist())
     return numbers if between == " " else f"({numbers})"

@@ -1,4 +1,4 @@
-"""Refusals of inputs about one object that contradict each other: clouds, meshes, contacts and tables."""
+"""Checks that the cloud, mesh, contacts and table of one object do not contradict each other."""
 
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,9 @@ def check_agreement(
     slack: float,
     share: float,
 ) -> None:
-    """Refuse an argument if more than a share of points lie off a mesh, or off a cloud and the space it hides.
+    """Raise `BadArgument` if points lie off a mesh, or off a cloud and the space hidden behind the cloud.
+
+    Of the points, at most the given share may be farther than `slack` [m] from the `other` mesh or cloud.
 
     >>> from trimesh.creation import icosphere
     >>> check_agreement("mesh", torch.eye(3), "points", icosphere(), slack=0.02, share=0.2)
@@ -45,12 +47,12 @@ def check_agreement(
 
 
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
-    """Raise `BadArgument` for a true mesh that does not lie on the cloud of its object."""
+    """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh."""
     check_agreement(name, cloud.points, "the cloud's points", mesh, 0.01 + 2 * _noise(cloud), 0.2)
 
 
 def check_foot(cloud: PointCloud, table: Plane) -> None:
-    """Refuse a table above the lower points of its object; raises `BadArgument`."""
+    """Raise `BadArgument` for a table that lies above the lowest points of its object."""
     foot = float(table.height(cloud.points.double().cpu()).quantile(0.02))
     if -foot > 0.015 + 2 * _noise(cloud):
         found = f"one {-1e3 * foot:.0f} mm above the object's foot"
@@ -58,7 +60,7 @@ def check_foot(cloud: PointCloud, table: Plane) -> None:
 
 
 def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> None:
-    """Refuse a true mesh that does not stand on its table; raises `BadArgument`."""
+    """Raise `BadArgument` if an object's mesh does not stand on the table, but floats above it or sinks into it."""
     foot = float(table.height(torch.tensor(mesh.vertices, dtype=torch.float64)).min())
     if abs(foot) > 0.015:
         found = f"one whose foot is {1e3 * abs(foot):.0f} mm {'above' if foot > 0 else 'below'} the table"
@@ -66,13 +68,16 @@ def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> No
 
 
 def _noise(cloud: PointCloud) -> float:
-    """Return the noise [m] that is assumed of a depth camera."""
+    """Return the depth noise [m] that is assumed for a cloud's camera, as the median over the points."""
     eye = None if cloud.viewpoint is None else cloud.viewpoint.double().cpu().reshape(-1, 3).mean(0)
     return float(assume_noise(cloud.points.double().cpu(), eye).median())
 
 
 def _distance_behind(points: Float[Tensor, "n 3"], cloud: PointCloud) -> Float[Tensor, "n"]:
-    """Return the distance [m] to the rays behind a cloud, as long as the cloud; without a camera, in any direction."""
+    """Return each point's distance [m] from a cloud and the space behind the cloud, as deep as the cloud is long.
+
+    If the camera is unknown, the space within half of this length around the cloud counts as hidden.
+    """
     rows = draw_rows(len(cloud), 500)
     seen = cloud.points[rows].double().cpu()
     length = float(torch.linalg.vector_norm(seen.amax(0) - seen.amin(0)))

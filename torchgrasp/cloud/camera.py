@@ -1,4 +1,4 @@
-"""A virtual depth camera, exact or with the noise of a real one."""
+"""A virtual depth camera, exact or with the noise of a real camera."""
 
 import math
 from collections.abc import Sequence
@@ -32,13 +32,13 @@ def look_at(
     distance: Annotated[float, Range(0.01, 10.0)] = 0.5,
     target: "Float[Tensor, '3'] | trimesh.Trimesh | None" = None,
 ) -> Float[Tensor, "4 4"]:
-    """Return obj_from_camera of an upright camera that looks at a target.
+    """Return the pose obj_from_camera (4 x 4) of an upright camera that looks at a target.
 
     Args:
         azimuth: direction of the camera, from x towards y [deg].
-        elevation: its angle above the horizontal [deg], in [-89.9, 89.9].
+        elevation: angle of the camera above the horizontal [deg], in [-89.9, 89.9].
         distance: distance of the camera from the target [m], in [0.01, 10].
-        target: point (3,) [m] in the middle of the image, or a mesh, for the centre of its box; by default the origin.
+        target: point (3,) [m] in the middle of the image; or a mesh for the centre of its box, or None for the origin.
 
     Raises:
         BadArgument: an angle or a distance outside its range.
@@ -75,10 +75,10 @@ def partial_view(
     missing pixels at rims, and surfaces that fade out at grazing angles.
 
     Args:
-        mesh: the object's mesh in its own frame [m].
-        camera_pose: obj_from_camera, see `look_at`.
-        n: points drawn from the pixels; all pixels if there are fewer.
-        noise: the name of a camera, or its `SensorNoise`; False gives exact depths.
+        mesh: surface of the object, in the object frame [m].
+        camera_pose: transform obj_from_camera (4 x 4), see `look_at`.
+        n: number of pixels drawn at random; if there are fewer pixels, all are returned.
+        noise: True for the default noise, False for exact depths, the name of a camera, or a `SensorNoise`.
         seed: random seed of the noise and of the choice of points.
 
     Raises:
@@ -104,7 +104,7 @@ def partial_view(
 def cast_mesh(
     mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Return depth [m] and |cosine| of ray and face normal, both 0 where the ray meets nothing."""
+    """Return a mesh's depth image [m], and |cosine| between ray and face normal; both are 0 where a ray misses."""
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
     row, column = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
@@ -129,7 +129,7 @@ def cast_mesh(
 def _in_image_box(
     mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"], x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]
 ) -> Bool[Tensor, "h w"]:
-    """Mark the rays (x, y, 1) that may meet the mesh."""
+    """Return a mask of the camera rays (x, y, 1) that pass through the image's box around the mesh."""
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
     if float(depth.min()) <= 1e-3:
@@ -146,16 +146,16 @@ def render_depth(
     noise: bool | SensorName | SensorNoise = True,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Return a depth image [m] of meshes on a table, as the default camera measures it, and exact labels.
+    """Return a depth image [m] of meshes on a table, as the default camera measures it, and true pixel labels.
 
     Depth is 0 where nothing was measured. Label 0 is the table or nothing, label k is mesh k - 1. The table is a disc
     of radius 0.6 m about the origin.
 
     Args:
-        meshes: the objects' meshes in the world frame [m].
-        camera_pose: world_from_camera, see `look_at`.
-        table: height z of the table [m]; None means no table.
-        noise: as in `partial_view`.
+        meshes: surfaces of the objects, in the world frame [m].
+        camera_pose: transform world_from_camera (4 x 4), see `look_at`.
+        table: height z of the table [m]; None for no table.
+        noise: True for the default noise, False for exact depths, the name of a camera, or a `SensorNoise`.
         seed: random seed of the noise.
 
     Raises:
@@ -179,7 +179,7 @@ def render_depth(
 def _cast_table(
     height: float, obj_from_camera: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Return depth [m] of the table and |cosine| of ray and normal, both 0 where the ray misses the table."""
+    """Return the table's depth image [m], and |cosine| between ray and normal; both are 0 where a ray misses."""
     row, column = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
     rays = torch.stack([column, row, torch.ones_like(row)], -1) @ torch.linalg.inv(INTRINSICS).T
     direction, origin = rotate(obj_from_camera, rays), obj_from_camera[:3, 3]

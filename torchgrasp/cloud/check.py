@@ -1,4 +1,4 @@
-"""Refusals of clouds that no grasp can be planned on, and removal of points: copies, outliers, dense points."""
+"""Checks of point clouds, and removal of points: duplicates, outliers, and surplus points of dense clouds."""
 
 from typing import Annotated
 
@@ -17,7 +17,7 @@ MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated
 
 @checked
 def check_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the cloud itself, or refuse it. A flat cloud, such as a view of one face, is accepted.
+    """Return the cloud itself if it is fit for grasp planning, else raise an error. A flat cloud is fit, too.
 
     Raises:
         BadArgument: a number that is not finite; a tensor that requires a gradient; points that all coincide or lie
@@ -36,9 +36,9 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 
 @checked
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
-    """Check a cloud and return it without copies of its points, which would count as independent measurements.
+    """Check a cloud, and return it without duplicate points, which would count as independent measurements.
 
-    Of points closer than 1e-9 of the extent only the first is kept. Raises the errors of `check_cloud`.
+    Of points closer together than 1e-9 of the extent, only the first is kept. Raises the errors of `check_cloud`.
     """
     points = _check(cloud)
     rows = _distinct_rows(points)
@@ -48,7 +48,7 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
 
 @checked
 def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)]) -> PointCloud:
-    """Return one point a voxel, the nearest to its centre, in the order of the cloud.
+    """Return a thinned cloud with one point of each voxel, the nearest to the voxel's centre, in the given order.
 
     The grid starts at the cloud's lowest corner. Points are not averaged, since a mean may lie inside a thin wall.
 
@@ -77,9 +77,10 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
 
 @checked
 def remove_outliers(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without copies and outliers, such as flying pixels.
+    """Return a cloud without duplicate points and without outliers, such as flying pixels.
 
-    Outliers have a mean distance to 8 neighbours above 2.5 times the median. Raises the errors of `check_cloud`.
+    The mean distance of an outlier to its 8 nearest neighbours is more than 2.5 times the median of all points.
+    Raises the errors of `check_cloud`.
 
     >>> points = torch.cat([0.1 * torch.rand(500, 3), torch.ones(1, 3)])
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)
@@ -90,7 +91,7 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
 
 
 def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> None:
-    """Refuse too few distinct rows, and points on a line."""
+    """Raise an error if the distinct points, at the indices `rows`, are too few, or if all points lie on a line."""
     if len(rows) < MIN_POINTS:
         raise TooFewPoints("points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points")
     spread = torch.linalg.svdvals((points - points.mean(0)).double())
@@ -99,7 +100,7 @@ def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> Non
 
 
 def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
-    """Return the points, or refuse the cloud for its extent or its normals."""
+    """Return the cloud's points, or raise an error if its extent is implausible or a normal has length zero."""
     points = cloud.points
     extent = float((points.amax(0) - points.amin(0)).max())
     if extent == 0.0:
@@ -125,7 +126,7 @@ def _guess_unit(extent: float) -> str:
 
 
 def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
-    """Return the indices of the distinct points, ascending: of coincident points only the first."""
+    """Return the indices of the distinct points, ascending; of coincident points only the first counts."""
     from scipy.spatial import KDTree
 
     points = points.detach().double()
@@ -141,6 +142,6 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
 
 
 def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
-    """Return the first index of each group, for numbers of groups without gaps."""
+    """Return, for each of the groups 0, 1, ..., the first index at which `group` holds the group's number."""
     order = torch.arange(len(group), device=group.device)
     return torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")[: int(group.max()) + 1]

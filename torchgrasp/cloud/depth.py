@@ -1,4 +1,4 @@
-"""From depth images to point clouds."""
+"""Point clouds from depth images, and checks of the depth, the intrinsics and the mask."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -44,14 +44,16 @@ def cloud_from_depth(
         intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], its 9 numbers, a 3 x 4 projection matrix, (fx, fy, cx, cy)
             [pixels], or (fx, fy, cx, cy, width, height) with the size of the image, which may be a crop. Or the dict or
             object of ROS (CameraInfo), Open3D, RealSense, Zivid or BOP, with its depth_scale.
-        mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None means all measured pixels.
-        camera_pose: obj_from_camera (4, 4), rigid; without it the result is in the camera's frame.
-        depth_unit: metres of one count of the depth, such as 0.00025; by default that of the intrinsics or of `depth`.
-        up: (3,), against gravity in the frame of the pose, to which a table in the image is compared; z by default.
+        mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None for all measured pixels.
+        camera_pose: obj_from_camera (4, 4), rigid; None if the result shall be in the camera's frame.
+        depth_unit: metres for one count of the depth, such as 0.00025; None for the depth_scale of the intrinsics, else
+            for the units under `depth`.
+        up: direction (3,) against gravity, in the object frame, with which the normal of a table in the image is
+            compared; None for z.
 
     Raises:
         BadArgument: depth that is negative or of another unit; intrinsics of another resolution; a mask of another size
-            or without pixels; a pose that is not rigid, is more than 100 m off, or turns a table in the image over.
+            or without pixels; a pose that is not rigid, is more than 100 m off, or turns a table upside down.
         TooFewPoints: fewer than 4 measured pixels.
         SuspiciousScale: an extent outside [5 mm, 2 m], as of a scene without a mask.
 
@@ -76,14 +78,14 @@ def cloud_from_depth(
 
 
 def _points(z_image: Float[Tensor, "h w"], k: Float[Tensor, "3 3"], keep: Bool[Tensor, "h w"]) -> Float[Tensor, "n 3"]:
-    """Return the points [m] of pixels in the camera's frame."""
+    """Return the points [m], in the camera's frame, of the pixels in the mask `keep`."""
     row, column = torch.nonzero(keep, as_tuple=True)
     z = z_image[keep]
     return torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
 
 
 def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> Float[Tensor, "4 3"]:
-    """Return the inward unit normals of the sides of a camera's view (h, w): left, right, top, bottom."""
+    """Return the inward unit normals of a camera's frustum, for an image (h, w): left, right, top, bottom side."""
     (fx, _, cx), (_, fy, cy) = intrinsics[0].tolist(), intrinsics[1].tolist()
     height, width = size
     sides = [[fx, 0.0, cx], [-fx, 0.0, width - 1 - cx], [0.0, fy, cy], [0.0, -fy, height - 1 - cy]]
@@ -97,7 +99,7 @@ def read_depth(
     mask: Tensor | np.ndarray | None = None,
     depth_unit: Positive | None = None,
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"], Bool[Tensor, "h w"] | None]:
-    """Check the arguments of `cloud_from_depth`; return depth [m] (0 if not measured), intrinsics and mask."""
+    """Check the arguments of `cloud_from_depth`; return depth [m] (0 if not measured), intrinsics [px] and mask."""
     k, stated, scale = _read_intrinsics(intrinsics)
     image = _as_tensor("depth", depth)
     if image.ndim == 3 and 1 in (image.shape[0], image.shape[-1]):  # one channel
@@ -123,7 +125,7 @@ def read_depth(
 
 
 def _in_metres(image: Tensor, unit: float | None) -> Float[Tensor, "h w"]:
-    """Return depth in float64 [m], 0 where nothing was measured; refuse depth of another unit."""
+    """Return a depth image in float64 [m], 0 where nothing was measured; refuse depths that cannot be metres."""
     counts = image.double()
     metres = counts * unit if unit else counts if image.is_floating_point() else counts / 1000
     metres = torch.where(torch.isfinite(metres), metres, 0.0)
@@ -145,7 +147,7 @@ def _in_metres(image: Tensor, unit: float | None) -> Float[Tensor, "h w"]:
 
 
 def _read_forms(value: object) -> tuple[Any, list[float] | None, float | None, list[float]]:
-    """Return numbers of intrinsics, their [width, height], metres of a count, and ROS's window, from any form."""
+    """Return, from any form of intrinsics, their numbers, image [width, height], metres per count and ROS's window."""
     if isinstance(value, Tensor | np.ndarray | Sequence) and not isinstance(value, str):
         return value, None, None, []
     names = (*MATRICES, "K", "fx", "fy", "cx", "cy", "ppx", "ppy", "width", "height", "roi", "binning_x", "binning_y")
@@ -176,7 +178,7 @@ def _read_forms(value: object) -> tuple[Any, list[float] | None, float | None, l
 
 
 def _window(named: Mapping[str, Any]) -> list[float]:
-    """Return corner, width and height of ROS's region of interest [px] (0 for the whole image), and its binning."""
+    """Return x, y, width and height of ROS's region of interest [px], and the binning in x and y; 0 if not set."""
     roi, sides = named.get("roi", {}), ("x_offset", "y_offset", "width", "height")
     found: list[Any] = [roi.get(side, 0) if isinstance(roi, Mapping) else getattr(roi, side, 0) for side in sides]
     found += [named.get("binning_x", 0), named.get("binning_y", 0)]
@@ -186,7 +188,7 @@ def _window(named: Mapping[str, Any]) -> list[float]:
 
 
 def _is_table(value: object) -> bool:
-    """Return whether a value of a file is a list of at most 12 numbers, or of rows of at most 4."""
+    """Return whether a value from a file is a list of at most 12 numbers, or of rows of at most 4."""
     if not isinstance(value, list | tuple) or not 0 < len(value) <= 12:
         return False
     parts = [x for row in value for x in (row[:5] if isinstance(row, list | tuple) else [row])]
@@ -224,7 +226,7 @@ def _read_intrinsics(value: object) -> tuple[Float[Tensor, "3 3"], list[float] |
 
 
 def _wrong_numbers(k: Float[Tensor, "3 3"], size: Sequence[int]) -> tuple[str, str] | None:
-    """Return what is wrong with numbers that no camera has, and what would be right; None if nothing is wrong."""
+    """Return what is wrong with intrinsics that no camera has, and the fix; None if the intrinsics are plausible."""
     height, width = size
     (fx, _, cx), (_, fy, cy) = k[:2].tolist()
     if min(fx / width, fy / height) < 0.15:
@@ -245,9 +247,9 @@ def _wrong_numbers(k: Float[Tensor, "3 3"], size: Sequence[int]) -> tuple[str, s
 
 
 def _wrong_size(k: Float[Tensor, "3 3"], stated: list[float] | None, size: Sequence[int]) -> tuple[str, str] | None:
-    """Return the other resolution that intrinsics belong to, and what would be right; None if they fit image or crop.
+    """Return the error and its fix if intrinsics belong to another resolution; None if they fit the image or a crop.
 
-    Without a stated size, the double principal point is compared with multiples of the image and with cameras' modes.
+    If no size is stated, twice the principal point is compared with multiples of the image's size and common sizes.
     """
     height, width = size
     image, centre = k.new_tensor([width, height]), 2 * k[:2, 2]
@@ -277,7 +279,7 @@ def _wrong_size(k: Float[Tensor, "3 3"], stated: list[float] | None, size: Seque
 
 
 def _as_tensor(name: str, value: Any) -> Tensor:
-    """Return an array of numbers as a tensor, or refuse it."""
+    """Return an array of numbers as a tensor; raise `BadArgument` about `name` for anything else."""
     if isinstance(value, Tensor):
         return value
     try:
@@ -288,6 +290,6 @@ def _as_tensor(name: str, value: Any) -> Tensor:
 
 
 def _describe(value: object) -> str:
-    """Return the type of an image, its shape and its dtype."""
+    """Return the type, the shape and the dtype of an image as text."""
     shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", "no dtype")
     return f"{type(value).__name__} of shape {tuple(shape)}, {dtype}"

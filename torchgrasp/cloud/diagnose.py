@@ -1,4 +1,4 @@
-"""A report on a cloud, with advice for a better one."""
+"""A report on the quality of a point cloud, with advice on how to improve it."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ from torchgrasp.values import PointCloud
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
-    """The properties of a cloud, with advice for a better one.
+    """The measured properties of a point cloud, with advice on how to improve it.
 
     >>> from torchgrasp import load_object
     >>> report = diagnose_cloud(load_object("jug").view)
@@ -52,12 +52,12 @@ def diagnose_cloud(
 ) -> CloudReport:
     """Measure a cloud, and advise what would improve it.
 
-    Of large clouds 50 000 points are measured, and 5000 serve the advice on camera, vertical, table and bodies.
+    In a large cloud, 50 000 points are measured; 5000 of them serve the advice on camera, vertical, table and bodies.
 
     Args:
         cloud: points of one object [m].
-        up: the vertical, of any length; by default z, unless the cloud looks like one in its camera's frame.
-        table: the table; None means one at the lowest point.
+        up: vector of any length that points up; None for z, unless the cloud looks as if in its camera's frame.
+        table: plane of the table; None if the table is assumed at the lowest point.
         stands: whether the object stands on a table; else the camera may be below it.
 
     Raises:
@@ -149,7 +149,7 @@ def format_report(report: CloudReport) -> str:
 
 
 def _advise(report: CloudReport, clean: PointCloud, angle: float) -> list[Advice]:
-    """Return advice on size, density, noise, outliers, flatness, normals and a viewpoint within an angle [deg]."""
+    """Return advice on size, density, noise, outliers, flatness, normals, and a camera uncertain by `angle` [deg]."""
     longest, outliers, given = max(report.size), report.outliers / report.points, report.viewpoint_given
     voxel = 1.0 / math.sqrt(max(report.density * MAX_POINTS / report.points, 1e-12))
     thickness, _, length = torch.linalg.svdvals((clean.points - clean.points.mean(0)).double()).sort().values.tolist()

@@ -1,4 +1,4 @@
-"""Outliers, local planes and local quadrics, from the nearest points."""
+"""Outliers, local planes and local quadrics of a cloud, computed from the nearest neighbours of each point."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from torchgrasp.geometry.linalg import unit
 
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
-    """Return the indices of at most so many points, drawn with a fixed seed, ascending."""
+    """Return at most `most` of the indices 0 to `count` - 1, drawn with a fixed seed, in ascending order."""
     if count <= most:
         return torch.arange(count)
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most].sort().values
@@ -18,9 +18,9 @@ def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
 def nearest(
     points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
-    """Return distances and indices of the k points nearest to each point of `rows` (by default all), itself first.
+    """Return distances and indices of the k nearest points to each point in `rows`, by default to every point.
 
-    A small cloud has fewer neighbours.
+    Each point itself comes first in its row. A cloud of fewer than k points gives fewer columns.
     """
     from scipy.spatial import KDTree
 
@@ -39,16 +39,16 @@ def find_inliers(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = N
 def fit_planes(
     points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Return normals, of unknown sign, and weighted rms [m] of local planes about points, by default all."""
+    """Fit a plane around each point in `rows`, by default each point; return normals of any sign and rms errors [m]."""
     near, weight = _neighbourhood(points, 25, rows)  # about eight for each of a plane's three unknowns
     mean_squares, axes = _principal_axes(near, weight)
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
 
 def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Return the feet of all points on local quadrics, unit normals there, and weighted rms [m].
+    """Fit a quadric around each point; return the point moved onto it, the unit normal there, and the rms error [m].
 
-    Planes would move points of a ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
+    Planes would move the points of a ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
     """
     block = 1 << 14  # bounds the memory for clouds of any size
     distance, index = nearest(points, 30)  # five for each of a quadric's six unknowns
@@ -60,7 +60,7 @@ def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Fl
 def _fit_block(
     points: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], weight: Float[Tensor, "m k"]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Return the results of `fit_quadrics` for some points, given the points near each."""
+    """Return the results of `fit_quadrics` for some points, given each point's neighbours and their weights."""
     _, axes = _principal_axes(near, weight)
     height, u, v = ((near - points[:, None]) @ axes).unbind(-1)
     size = torch.stack([u, v], -1).norm(dim=-1).amax(-1, keepdim=True)
@@ -79,13 +79,13 @@ def _fit_block(
 def _neighbourhood(
     points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k 3"], Float[Tensor, "m k"]]:
-    """Return the k nearest points and their weights."""
+    """Return the k points nearest to each point in `rows`, by default to every point, and their weights."""
     distance, index = nearest(points, k, rows)
     return points[index], _weigh(distance)
 
 
 def _weigh(distance: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:
-    """Return the weights exp(-(d / 0.7 d_k)^2) of near points, normalised."""
+    """Return the weights exp(-(d / 0.7 d_k)^2) of neighbours, scaled to sum 1; d_k is the farthest distance d."""
     weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
     return weight / weight.sum(-1, keepdim=True)
 
@@ -93,6 +93,6 @@ def _weigh(distance: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:
 def _principal_axes(
     near: Float[Tensor, "n k 3"], weight: Float[Tensor, "n k"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-    """Return mean squares along the principal axes, ascending, and the axes as columns."""
+    """Return the weighted variances of neighbours along their principal axes, ascending, and the axes as columns."""
     difference = near - (weight[..., None] * near).sum(1)[:, None]
     return torch.linalg.eigh((weight[..., None] * difference).transpose(-1, -2) @ difference)

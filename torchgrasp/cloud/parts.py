@@ -19,7 +19,7 @@ GAP = 0.04  # least distance [m] between bodies; a bent or hidden surface of one
 
 
 def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, "n"]:
-    """Number the groups of points [m] that a gap [m] separates, the largest first."""
+    """Return the group number of each point; groups are more than `gap` [m] apart, and group 0 is the largest."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
@@ -38,7 +38,7 @@ def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, 
 
 
 def find_second_body(points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], spacing: float) -> Bool[Tensor, "n"] | None:
-    """Mark the points [m] of a second body that stands apart on the same ground, if there is one."""
+    """Return a mask of the points of a second body that stands apart on the same ground; None if there is none."""
     label = label_bodies(points, max(GAP, 4 * spacing))
     height = points @ up
     for k in range(1, int(label.max()) + 1):
@@ -61,9 +61,9 @@ def cut_object(
 
     Args:
         cloud: points [m] of a scene.
-        up: the vertical, of unit length.
-        point: on or near the object [m]; points farther than 0.5 m from it are left out. None means the largest object.
-        box: two corners [m]; points outside are left out first.
+        up: unit vector that points up.
+        point: place on or near the object [m]; points over 0.5 m away are left out. None for the largest object.
+        box: two opposite corners [m] of a box along the axes; points outside are left out first.
         gap: least distance [m] between objects.
 
     Raises:
@@ -99,7 +99,7 @@ def cut_object(
 
 
 def _find_support(cloud: PointCloud, up: Float[Tensor, "3"]) -> Support | None:
-    """Return the support of a scene: near level, or any that its camera looks down on."""
+    """Return the plane on which a scene's objects stand: nearly level, else any that the camera looks down on."""
     eye = cloud.viewpoint if cloud.viewpoint is None or cloud.viewpoint.ndim == 1 else cloud.viewpoint.mean(0)
     for sky in (up, *([None] if eye is not None else [])):
         try:
@@ -110,7 +110,7 @@ def _find_support(cloud: PointCloud, up: Float[Tensor, "3"]) -> Support | None:
 
 
 def _select(cloud: PointCloud, keep: Bool[Tensor, "n"], what: str) -> PointCloud:
-    """Select points; refuse too few."""
+    """Return the points in the mask `keep`; raise `TooFewPoints`, which calls the points `what`, for fewer than 4."""
     if int(keep.sum()) < MIN_POINTS:
         raise TooFewPoints("cloud", f"{int(keep.sum())} {what}", f"at least {MIN_POINTS} {what}")
     return cloud.select(keep)

@@ -9,7 +9,7 @@ from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
-    """Return points, normals and viewpoint of a PCD file, or None, and whether the viewpoint is the default.
+    """Return points, normals and viewpoint of a PCD file, None if missing, and whether the viewpoint is `default`.
 
     Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0`, wherever the camera was.
 
@@ -53,7 +53,7 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
-    """Split a PCD file into its header's words and the data."""
+    """Return the header of a PCD file, the words of each line by its first word, and the data after the header."""
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
@@ -68,7 +68,7 @@ def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
 
 
 def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
-    """Return compressed rows as rows: the file holds one field after the other."""
+    """Return decompressed data point by point; the compressed data hold each field for all points in turn."""
     packed, unpacked = (int(n) for n in np.frombuffer(body, dtype="<u4", count=2))
     wanted = count * sum(kind.itemsize for kind in kinds)
     if unpacked != wanted or wanted > CLOUD_BYTES or packed > len(body) - 8:
@@ -81,10 +81,10 @@ def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
 
 
 def decompress(data: bytes, size: int) -> bytes:
-    """Return the `size` bytes that LZF data holds.
+    """Return the `size` bytes to which LZF-compressed data expand.
 
-    A byte c < 32 is followed by c + 1 literal bytes. Any other gives a copy of (c >> 5) + 2 earlier bytes, where a
-    length of 9 is extended by one more byte; the distance has 13 bits.
+    A control byte c < 32 is followed by c + 1 literal bytes. A larger c means a copy of (c >> 5) + 2 earlier bytes; a
+    length of 9 is extended by the next byte. The distance back to the copied bytes has 13 bits.
 
     Raises:
         ValueError: data that end early, hold more or fewer bytes, or copy bytes from before their start.

@@ -1,4 +1,4 @@
-"""The PLY format; a mesh gives points of its surface."""
+"""Reader and writer of the PLY format; a mesh is read as points on its surface."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ TYPES = {
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals, viewpoint, frustum and table of a PLY file, or None for what it lacks.
+    """Return points, normals, viewpoint, frustum and table of a PLY file by name; entries that it lacks are None.
 
     Raises:
         ValueError: no PLY file; fewer bytes than the header promises.
@@ -70,7 +70,7 @@ def format_ply(
     frustum: np.ndarray | None = None,
     table: np.ndarray | None = None,
 ) -> bytes:
-    """Return a binary PLY file. Comment lines hold the viewpoint, the sides of its view, and the table."""
+    """Return the bytes of a binary PLY file; comment lines hold the viewpoint, the frustum and the table."""
     lines = ["ply", "format binary_little_endian 1.0"]
     for name, numbers in (("viewpoint", viewpoint), ("frustum", frustum), ("table", table)):
         if numbers is not None:
@@ -83,7 +83,7 @@ def format_ply(
 
 
 def _split_header(data: bytes) -> tuple[list[str], bytes]:
-    """Split a PLY file into its header's lines and the data."""
+    """Return the lines of a PLY file's header, and the data after the header."""
     end = data.find(b"end_header", 0, 65536)
     stop = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or stop == 0:
@@ -92,7 +92,7 @@ def _split_header(data: bytes) -> tuple[list[str], bytes]:
 
 
 def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple[str, str]]) -> dict[str, np.ndarray]:
-    """Return the columns of the vertex element by name."""
+    """Return the numbers of each property of the vertices, by the name of the property."""
     names = [name for name, _ in properties]
     if len(set(names)) != len(names) or not 0 <= count <= CLOUD_POINTS:
         raise ValueError(f"the properties {names} of {count} vertices")
@@ -106,7 +106,7 @@ def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple
 
 
 def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return surface points of a mesh, with normals if it is closed."""
+    """Return points on the surface of a PLY file's mesh, and their normals; None if the mesh is not closed."""
     import trimesh
 
     try:

@@ -1,4 +1,4 @@
-"""The pose of a depth camera: read, rigid, and not contradicted by what the camera sees."""
+"""Reading of a depth camera's pose, and checks that the pose is rigid and fits the camera's view."""
 
 import contextlib
 import math
@@ -20,7 +20,7 @@ UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count 
 
 
 def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
-    """Return a transform that is rigid to 1e-4; refuse others, and say what they are."""
+    """Return the given pose if it is rigid to 1e-4; else raise `BadArgument`, which names the fault."""
     fixes = {(3, 4): "add the row 0 0 0 1", (16,): "reshape it to 4 x 4", (7,): "make a matrix of the quaternion"}
     if tuple(pose.shape) in fixes:
         raise BadArgument(name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fixes[tuple(pose.shape)]}")
@@ -31,7 +31,7 @@ def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
 
 
 def _describe_fault(pose: Float[Tensor, "4 4"]) -> str:
-    """Return why a matrix is not a rigid transform, and what would mend it."""
+    """Return, as the end of a sentence, why a matrix is no rigid transform, and the fix."""
     if bool(pose[3, :3].any()) and not bool(pose[:3, 3].any()):
         return ", a transposed pose: give its transpose"
     length, side = torch.linalg.vector_norm(pose[:3, :3], dim=0), torch.linalg.det(pose[:3, :3])
@@ -58,7 +58,7 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Float[Tensor, "4 4"]:
 
 
 def check_distance(pose: Float[Tensor, "4 4"], distance: float, most: float, what: str) -> None:
-    """Refuse a pose in another unit, by a distance [m] from the frame's origin."""
+    """Refuse a pose as not in metres if `what`, such as the camera, is over `most` [m] from the frame's origin."""
     if abs(distance) > most:
         factor = 1000 if float(pose[:3, 3].abs().max()) > 200 else 100
         allowed = f"a pose in metres; in {'mm' if factor == 1000 else 'cm'}, divide camera_pose[:3, 3] by {factor}"
@@ -83,7 +83,7 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
 def find_plausible(
     points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], table: Plane | float | None, up: object, known_unit: bool
 ) -> tuple[Support, ...]:
-    """Return the supports that `find_table` finds; refuse a pose or a unit that the view contradicts.
+    """Return the planes on which objects may stand; refuse a pose or a depth unit that contradicts the view.
 
     `known_unit` says whether the user stated the unit of the depth.
     """
@@ -107,18 +107,18 @@ def find_plausible(
 
 
 def check_view(points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
-    """Refuse a pose or a unit that a support in the view contradicts; see `find_plausible`."""
+    """Raise `BadArgument` if a table in the view contradicts the camera's pose or the unit of the depth."""
     with contextlib.suppress(NoSupport):
         _check_supports(find_table(points, pose[:3, 3], None, None), pose, up, known_unit)
 
 
 def _is_own(pose: Float[Tensor, "4 4"]) -> bool:
-    """Return whether a pose is nearly the identity: in the camera's frame any direction may be up."""
+    """Return whether a pose is nearly the identity, so that the frame is the camera's, where z need not be up."""
     return float(torch.diagonal(pose[:3, :3]).min()) > 0.985 and float(torch.linalg.vector_norm(pose[:3, 3])) < 0.1
 
 
 def _check_supports(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
-    """Refuse a pose that contradicts the supports, and a camera that is too high above the first."""
+    """Refuse a pose that contradicts the planes on which objects stand, or a camera too high above the first one."""
     plane = supports[0].plane
     if not _is_own(pose):
         _check_normals(supports, pose, up)
@@ -162,7 +162,7 @@ def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up
 
 
 def _check_given_table(points: Float[Tensor, "n 3"], plane: Plane) -> None:
-    """Refuse a table that the camera did not see, below or far above all points."""
+    """Refuse a given table that the camera did not see: it is above most points, or far below all points."""
     height = plane.height(points[:: 1 + len(points) // 20_000].double())
     low, middle = float(torch.quantile(height, 0.01)), float(height.median())
     if float((height.abs() < 0.03).double().mean()) < 0.001 and (middle < 0 or low > 0.5):
@@ -173,7 +173,7 @@ def _check_given_table(points: Float[Tensor, "n 3"], plane: Plane) -> None:
 def check_sizes(
     points: Float[Tensor, "n 3"], labels: Tensor, pose: Float[Tensor, "4 4"], plane: Plane
 ) -> tuple[str, ...]:
-    """Refuse depth in another unit: objects are far larger, or smaller, than a hand can grasp; note a high camera.
+    """Refuse a depth unit that makes objects too large or small for a hand; return a note if the camera is high.
 
     Counts of 0.25 mm read as millimetres put the camera four times too high above a table near z = 0.
     """

@@ -1,4 +1,4 @@
-"""Clouds with outward normals and without outliers, to which a shape is fitted; views merged into one cloud."""
+"""Preparation of clouds for the fit of a shape: outliers are removed, outward normals fitted, views merged."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """Consistency of the given normals."""
+    """The consistency of a cloud's given normals with those of neighbouring points."""
 
     flipped: Bool[Tensor, "n"]  # whether a normal opposes most of its neighbours' normals
     opposed: float  # share of opposite normals among pairs of neighbours
@@ -35,7 +35,7 @@ class NormalCheck(Value):
 
 @dataclasses.dataclass(frozen=True)
 class PreparedCloud(Value):
-    """A cloud that `prepare_cloud` has checked."""
+    """A checked cloud, and the points and normals to which a shape is fitted."""
 
     cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
     points: Float[Tensor, "n 3"]  # at most 2000 of them, in float64
@@ -45,7 +45,7 @@ class PreparedCloud(Value):
 
     @property
     def one_sided(self) -> bool:
-        """Whether the cloud is a view and has a hidden side."""
+        """Whether the cloud shows only what its cameras see, so that the object has a hidden side."""
         return self.viewpoint is not None and share_facing(self.points, self.normals, self.viewpoint) >= FACING
 
 
@@ -55,17 +55,17 @@ def prepare_cloud(
 ) -> PreparedCloud:
     """Check a cloud, and return the points and normals to which a shape is fitted.
 
-    Normals of random signs are ignored, since they make a view look whole. If `clean`, a viewpoint that the given
-    normals do not face is ignored, since the surface is whole.
+    Normals of random signs are ignored: with them a single view would look like a whole surface. If `clean`, a
+    viewpoint that too few given normals face is ignored: the cloud is then a whole surface.
 
     Args:
         cloud: points [m] of one or several views of one object.
-        generator: draws 2000 of the points if there are more.
+        generator: random generator that draws 2000 of the points if there are more.
         clean: remove outliers, fit all normals anew and estimate a missing viewpoint; else fit missing normals only.
-        up: the vertical, below which no viewpoint is estimated.
+        up: direction that points up; an estimated viewpoint is above the object.
 
     Raises:
-        BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras, each of which costs an outline.
+        BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras.
         TooFewPoints: see `check_cloud`; fewer than 10 points of one camera of several.
     """
     max_views, min_points = 16, 10
@@ -97,10 +97,10 @@ def prepare_cloud(
 
 @checked
 def estimate_normals(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without copies, with outward normals of local quadrics.
+    """Return a cloud without duplicate points, with outward unit normals of quadrics fitted around the points.
 
-    Outward is towards the viewpoint. Without a viewpoint it is the side of the given normals. Without normals, too, the
-    viewpoint is estimated.
+    Outward is towards the viewpoint. If the viewpoint is unknown, outward is the side of the given normals. If normals
+    are missing, too, the viewpoint is estimated.
 
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
@@ -113,16 +113,16 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 
 @checked
 def clean_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the points without outliers, on their local quadrics, with outward normals.
+    """Return a cloud without outliers, moved onto quadrics fitted around the points, with outward normals.
 
-    Outliers are those of `remove_outliers`, and points over 4.5 median rms from their quadric. Raises the errors of
-    `check_cloud`.
+    Outliers are those of `remove_outliers`, and points farther from their quadric than 4.5 times the median rms error.
+    Raises the errors of `check_cloud`.
     """
     return _fit_normals(remove_duplicates(cloud), clean=True)
 
 
 def _fit_normals(cloud: PointCloud, clean: bool, up: Float[Tensor, "3"] | None = None) -> PointCloud:
-    """Fit outward normals to distinct points, and clean them if asked."""
+    """Return distinct points with fitted outward normals; if `clean`, without outliers and moved onto the fit."""
     if clean:
         cloud = cloud.select(find_inliers(cloud.points.double()))
     points = cloud.points
@@ -143,7 +143,7 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Float[Tensor, "3"] | None =
 
 
 def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> NormalCheck:
-    """Compare the normals of neighbouring points."""
+    """Return how consistent the normals are among neighbouring points: flipped ones, and whether signs are trusted."""
     distance, index = nearest(points, 9)  # the point itself and eight neighbours: enough for a majority
     directions = unit(normals)
     cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
@@ -160,7 +160,7 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
 
 
 def orient_normals(normals: Float[Tensor, "n 3"], outward: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Return unit normals on the side of `outward` directions."""
+    """Return unit normals, each reversed if needed, so that it points to the side of its `outward` direction."""
     sign = torch.where((outward * normals).sum(-1, keepdim=True) < 0, -1.0, 1.0)
     return unit(sign * normals)
 
@@ -168,7 +168,7 @@ def orient_normals(normals: Float[Tensor, "n 3"], outward: Float[Tensor, "n 3"])
 def share_facing(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*views 3"]
 ) -> float:
-    """Return the share of normals that face the camera. A view has nearly 1, a whole surface half."""
+    """Return the share of normals that face the camera: nearly 1 in a single view, half on a whole surface."""
     return float((((viewpoint - points) * normals).sum(-1) > 0).double().mean())
 
 
@@ -176,14 +176,14 @@ def share_facing(
 def merge_clouds(
     clouds: Sequence[PointCloud], poses: Sequence[Float[Tensor, "4 4"]] | Float[Tensor, "k 4 4"]
 ) -> PointCloud:
-    """Return several views in one frame, with normals and the camera of each point.
+    """Return one cloud of several views in a common frame, with the normal and the camera position of each point.
 
     `estimate_normals` gives normals to a view without normals. A view with normals but without viewpoint leaves the
-    result without viewpoint. Overlaps are twice as dense; `voxel_downsample` evens them.
+    result without viewpoint. Points are denser where views overlap; `voxel_downsample` evens the density.
 
     Args:
         clouds: points [m] of the views, each in its own frame.
-        poses: obj_from_cloud of each view, rigid.
+        poses: rigid transform obj_from_cloud (4, 4) of each view.
 
     Raises:
         BadArgument: no cloud; another number of poses; a pose that is not rigid; clouds of several dtypes or devices.
@@ -215,7 +215,7 @@ def merge_clouds(
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
-    """Return a view with unit normals in the frame of the result."""
+    """Return a view, with unit normals, transformed into the frame of the merged cloud."""
     cloud = estimate_normals(cloud) if cloud.normals is None else cloud
     assert cloud.normals is not None
     pose, dtype = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype

@@ -1,4 +1,4 @@
-"""Point clouds from and to files. A malformed file is refused by name, and no file runs code."""
+"""Reading and writing of point clouds. Errors name the malformed file, and no file can run code."""
 
 import dataclasses
 import functools
@@ -29,7 +29,7 @@ from torchgrasp.values import PointCloud
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
-    """A cloud as it was read, and a sentence for each kind of data that was left out.
+    """A cloud as it was read from a file, and `notes`, a sentence for each kind of data that was left out.
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -57,15 +57,15 @@ def read_cloud(
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; VIEWPOINT gives the camera.
       Its default `0 0 0 1 0 0 0` counts only if the points look like those of a camera in the origin.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4, 3), `table` (4,);
-      of several views `viewpoint` (n, 3) and `frustum` (n, 4, 3).
+      for several views, `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`, `.xyz`, `.txt`, `.csv` (text): an (n, 3) array, or (n, 6) with normals; colours are left out.
 
-    Images (h, w, 3) of points are accepted. Rows with NaN, infinity or, more than once, (0, 0, 0) are left out.
+    Images (h, w, 3) of points are accepted. Rows with NaN or infinity are left out, and rows of zeros if several.
 
     Args:
         path: the file.
-        viewpoint: the camera's position (3,) [m] in the cloud's frame, instead of the file's.
-        unit: unit of the file's points and viewpoint.
+        viewpoint: the camera's position (3,) [m] in the cloud's frame; None for the viewpoint in the file.
+        unit: unit of length of the file's points and viewpoint.
 
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5 million points.
@@ -121,12 +121,12 @@ def read_cloud_file(
 def cloud_from_array(
     points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | Sequence[float | int] | None = None
 ) -> PointCloud:
-    """Return the cloud of NumPy arrays [m]; missing rows and colours are left out as by `read_cloud`.
+    """Return a cloud made of NumPy arrays [m]; points that were not measured, and colours, are left out.
 
     Args:
-        points: (n, 3), (h, w, 3) of an image, or with three more columns of normals.
-        normals: normals of the points, in the same shape, or None.
-        viewpoint: the camera (3,), or None.
+        points: (n, 3), or (h, w, 3) for an image; or with six columns, of which the last three are normals.
+        normals: outward normals, of the same shape as points, or None.
+        viewpoint: the camera's position (3,), or None.
 
     Raises:
         BadArgument, TooFewPoints, SuspiciousScale: see `read_cloud`.
@@ -163,7 +163,7 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
 
 
 def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = None, scale: float = 1.0) -> CloudFile:
-    """Return the cloud of named arrays in a unit of `scale` [m], without rows that were not measured."""
+    """Return the cloud, notes and table in named arrays, whose unit is `scale` [m]; rows not measured are left out."""
     notes: list[str] = []
     if "columns" in arrays:
         arrays = _split_columns(source, arrays, notes)
@@ -203,7 +203,7 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
 
 
 def _as_numbers(source: str, name: str, array: Any, *shapes: tuple[int, ...]) -> Tensor:
-    """Return finite numbers of one of the shapes, or refuse their file."""
+    """Return an array as a tensor if it has finite numbers and an allowed shape; else refuse the file `source`."""
     array = np.asarray(array)
     if array.dtype.kind not in "fiu" or array.shape not in shapes or not np.isfinite(array).all():
         allowed = f"finite numbers of shape {' or '.join(map(str, shapes))}"
@@ -212,7 +212,7 @@ def _as_numbers(source: str, name: str, array: Any, *shapes: tuple[int, ...]) ->
 
 
 def _as_rows(source: str, name: str, array: Any) -> Tensor:
-    """Return an array as float64 rows, or refuse its file."""
+    """Return an array of points as float64 rows (n, 3), or refuse the file `source`; a viewpoint may be (3,)."""
     array = np.asarray(array)
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{source}: {name} of type {array.dtype}", "real numbers")
@@ -228,7 +228,7 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
 
 
 def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dict[str, Any]:
-    """Split a table of 3 or 6 columns into points and normals; columns of colours are left out."""
+    """Return arrays in which the table of 3 or 6 columns is split into points and normals; colours are left out."""
     table = np.asarray(arrays["columns"])
     if table.ndim not in (2, 3) or table.shape[-1] not in (3, 6) or table.dtype.kind not in "fiu":
         found = f"{source}: an array of shape {table.shape} and type {table.dtype}"
@@ -247,7 +247,7 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
 
 
 def _find_measured(points: Tensor, normals: Tensor | None, notes: list[str]) -> tuple[Tensor, Tensor | None]:
-    """Return which rows were measured, and the normals, or None if most normals are missing."""
+    """Return a mask of the measured rows, and the normals (None if most are missing); add notes on the other rows."""
     finite = torch.isfinite(points).all(1)
     if not bool(finite.all()):
         notes.append(f"{int((~finite).sum())} of {len(points)} rows with NaN or infinity were left out")
@@ -268,7 +268,7 @@ def _find_measured(points: Tensor, normals: Tensor | None, notes: list[str]) -> 
 
 
 def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
-    """Keep the viewpoint (0, 0, 0) only if a camera can have been there."""
+    """Return the cloud, without its viewpoint (0, 0, 0) if no camera can have been there; a note then says so."""
     points = cloud.points[draw_rows(len(cloud), 2000)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]

@@ -1,4 +1,4 @@
-"""The noise of depth cameras: added to exact images, estimated from real ones, and reduced by several frames."""
+"""The noise of depth cameras: added to exact images, estimated from real images, and reduced by a median of frames."""
 
 import dataclasses
 import types
@@ -23,7 +23,7 @@ SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class SensorNoise(Value):
-    """The noise of a depth camera: random, in steps, smooth, at rims, in corners and on slanted surfaces.
+    """A model of a depth camera's noise: random noise, depth steps, smooth bias, and faults at rims and corners.
 
     >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
     True
@@ -53,7 +53,7 @@ class SensorNoise(Value):
 
 
 ACTIVE_STEREO = SensorNoise(base=616.0 * 0.055, disparity=0.12, step=1 / 32)
-"""An active stereo camera whose eyes are 55 mm apart, with independent noise of its pixels: `noise=True`."""
+"""Noise of an active stereo camera with a baseline of 55 mm and independent pixels; `noise=True` selects it."""
 
 SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType({
     # Intel's tuning guide of the D400: about 0.08 px of subpixel noise, 50 mm baseline; patches as in public frames.
@@ -81,7 +81,7 @@ def add_noise(
     generator: torch.Generator,
     sensor: SensorNoise = ACTIVE_STEREO,
 ) -> Float[Tensor, "h w"]:
-    """Add a camera's noise to a depth image [m], given |cosine| of ray and normal."""
+    """Return a depth image [m] with a camera's noise, given |cosine| between each ray and the surface normal."""
     from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
     normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
@@ -116,7 +116,7 @@ def add_noise(
 
 
 def _random_noise(depth: Tensor, normal: Tensor, sensor: SensorNoise) -> Tensor:
-    """Return depths [m] with the random noise of a camera, in its steps."""
+    """Return depths [m] with random noise, the standard normal numbers scaled to the camera, and with depth steps."""
     if not sensor.base:
         return depth + sensor.sigma(depth) * normal
     disparity = sensor.base / depth + sensor.disparity * normal
@@ -132,10 +132,10 @@ def estimate_noise(
         depth: image [m], 0 where nothing was measured.
         intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels].
         table: plane in the camera's frame.
-        on_table: pixels that may show the table; those more than 20 mm away from it do not count.
+        on_table: mask of pixels that may show the table; points over 20 mm from the plane do not count.
 
     Returns:
-        The noise of depths, or None if fewer than 1000 pixels show the table.
+        The noise of depths; None if fewer than 1000 pixels show the table.
     """
     from scipy.ndimage import uniform_filter
 
@@ -157,7 +157,7 @@ def estimate_noise(
 
 
 def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoise:
-    """Return the `floor` and `growth` of errors [m] about 0, of which some are outliers, at depths [m]."""
+    """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors [m] at given depths [m]."""
     from scipy.optimize import nnls
 
     if len(depth) < 100:

@@ -1,4 +1,4 @@
-"""Tables of numbers from strangers' files: NumPy's formats, none of which runs code, text, images, intrinsics."""
+"""Safe readers of untrusted files: NumPy arrays, text tables, images and camera intrinsics. No file can run code."""
 
 import functools
 import io
@@ -33,7 +33,7 @@ def parse_npy(data: bytes) -> np.ndarray:
 
 
 def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str, np.ndarray]:
-    """Return the arrays of these names in a .npz file, or all arrays if no name is given.
+    """Return the arrays of a .npz file by name: those with one of the given names, or all if no name is given.
 
     Raises:
         ValueError: no array of the `required` name, arrays that are too large unpacked, or what `parse_npy` refuses.
@@ -68,7 +68,7 @@ def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows 
 
 
 def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
-    """Return lines of numbers, separated by blanks, commas or semicolons.
+    """Return a text's numbers, one row for each line; blanks, commas or semicolons separate the numbers.
 
     `#` starts a comment. A first line that begins with the words x y z names the columns.
 
@@ -105,11 +105,11 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
 
 
 def read_image(name: str, path: Path | str) -> Any:
-    """Return the numbers of an image file: .npy, .npz, .png or .tiff; for depth also .exr, for masks also .json.
+    """Return the array in an image file: .npy, .npz, .png or .tiff; also .exr for depth, or .json for masks.
 
     Args:
-        name: what the file holds, named in errors. "depth" has one channel and an array of this name. "mask" may be a
-            picture, or several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
+        name: name of the argument in errors. "depth" has one channel, and is the array `depth` of a .npz file. "mask"
+            may be a picture or several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
         path: the file.
 
     Raises:
@@ -145,7 +145,7 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
     """Return the intrinsics in a .json, .yaml, .npy or .txt file, as `cloud_from_depth` takes them.
 
     Args:
-        name: the argument in errors.
+        name: name of the argument in errors.
         path: the file.
         image: number of the image, by which BOP's scene_camera.json names its entry.
 
@@ -171,7 +171,7 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
 
 
 def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
-    """Return the content and the suffix of a file, or refuse it."""
+    """Return the bytes and the suffix of a file; raise `BadArgument` if missing, too large or of another suffix."""
     path, allowed = Path(path), f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"
     check_file(path, CLOUD_BYTES, allowed, functools.partial(BadArgument, name))
     if path.suffix.lower() not in suffixes:
@@ -180,7 +180,7 @@ def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tup
 
 
 def _parse_picture(data: bytes, colours: bool) -> np.ndarray:
-    """Return the pixels of a PNG or TIFF: uint16, uint8, bool, or float32; `colours`: or of several channels."""
+    """Return the pixels of a PNG or TIFF image of one channel; if `colours`, several channels are allowed, too."""
     from PIL import Image
 
     with Image.open(io.BytesIO(data), formats=("PNG", "TIFF")) as image:
@@ -192,7 +192,7 @@ def _parse_picture(data: bytes, colours: bool) -> np.ndarray:
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    """Return the only channel of an OpenEXR file, or the one of depth."""
+    """Return the pixels of an OpenEXR file's depth channel (Z or V), or of its only channel."""
     import OpenEXR  # pyright: ignore[reportMissingImports]
 
     channels = OpenEXR.File(str(path)).channels()

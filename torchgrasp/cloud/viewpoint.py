@@ -1,4 +1,4 @@
-"""Where the camera of a view was: a guess, and whether a camera can have been at a place."""
+"""A guess of where the camera of a view was, and a test whether a camera can have been at a place."""
 
 import math
 
@@ -24,13 +24,14 @@ def guess_viewpoint(
 ) -> tuple[Float[Tensor, "3"], float]:
     """Return a camera position [m] that explains a view, and the angle [deg] within which the camera is likely.
 
-    Of the directions above the support, the one that `_explain` rates highest is taken, 4 radii away. The origin is
-    preferred if the view is in front of it and it can have been the camera. 180 degrees: the points hardly tell.
+    The camera is placed 4 radii of the cloud away, in the direction above the support that explains the points best.
+    The origin is preferred if the view is in front of it and a camera can have been there. An angle of 180 degrees
+    means that the points hardly tell the direction.
 
     Args:
         points: points of a view [m], without outliers.
-        normals: their normals, of unit length and any sign.
-        up: a direction above the support; the normal of a support in the points counts more.
+        normals: unit normals of any sign.
+        up: a direction above the support; if the points show a support, its normal replaces this direction.
         assumed: whether `up` is assumed, so that the cloud may be in its camera's frame instead.
     """
     rows = draw_rows(len(points), DRAWN).to(points.device)
@@ -57,10 +58,10 @@ def guess_viewpoint(
 
 
 def can_see(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> bool:
-    """Return whether a view looks as if seen from a place [m].
+    """Return whether a camera at a place [m] can have taken a view.
 
-    Points must not hide others there. Besides, either their density is that of pixels, or hardly any other place
-    explains them better, or a support is seen from above.
+    From there, points must not hide other points. Besides, the points are as dense as pixels, or hardly any other place
+    explains the points better, or a support is seen from above.
     """
     rows = draw_rows(len(points), DRAWN).to(points.device)
     points, normals = points[rows], normals[rows]
@@ -81,7 +82,7 @@ def can_see(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoi
 
 
 def _enclose(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
-    """Return the centre of the box along the principal axes, and the distance of the farthest point from it."""
+    """Return the centre of the points' box along their principal axes, and its distance to the farthest point."""
     axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh  # independent of the frame
     along = points @ axes.T
     centre = (along.amax(0) + along.amin(0)) / 2 @ axes
@@ -91,9 +92,10 @@ def _enclose(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Te
 def _explain(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoints: Float[Tensor, "k 3"]
 ) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
-    """Return how well cameras explain that objects bulge towards them, and the density of the points; 1: wholly.
+    """Return two scores of each camera position, at most 1: how well it explains the bulge and the points' density.
 
-    A pixel covers an area of surface that grows with the squared distance, over the cosine between ray and normal.
+    Visible surfaces bulge towards the camera. A pixel covers an area that grows with the squared distance, over the
+    cosine between ray and normal.
     """
     away = viewpoints - points[:, None]
     distance = torch.linalg.vector_norm(away, dim=-1).clamp_min(1e-12)
@@ -110,7 +112,10 @@ def _explain(
 def share_unseen(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
 ) -> tuple[float, float]:
-    """Return the shares of points that a camera would see edge-on, and of points behind others or behind the camera."""
+    """Return the share of points that a camera would see edge-on, and the share of points hidden behind others.
+
+    The second share is 1 if a point lies behind the camera.
+    """
     from scipy.spatial import KDTree
 
     ray = unit(points - viewpoint)
