@@ -18,7 +18,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.grasps import no_grasps
 
 PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoco", "coacd")
-"""Packages on whose versions the numbers depend."""
+"""Packages whose versions may change the results of a campaign."""
 Result = TypeVar("Result")
 CONNECTING = "30s"  # longest time for the scheduler to answer
 
@@ -77,7 +77,7 @@ def _work(view: View, hand: Hand, protocol: Protocol, spec: EvaluationSpec) -> S
 
 
 def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
-    """Return the shard of a job without a cloud and without grasps."""
+    """Return the data of a job that has neither a cloud nor grasps, as a shard."""
     points, tried = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, draws, dtype=torch.int64)
     return Shard((row,), Records(points, torch.zeros(1, 3, dtype=torch.float64), no_grasps(hand), tried.bool(), tried))
 
@@ -87,7 +87,7 @@ def run_on_cluster(
 ) -> Generator[tuple[int, Result | Status], None, None]:
     """Run tasks on a Dask cluster; yield the index of each task and its result, in the order in which they end.
 
-    A task whose worker dies is given to another one; after the deaths that the scheduler allows
+    A task whose worker dies is given to another worker; after the deaths that the scheduler allows
     (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task that takes longer
     than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. Tasks wait until a worker is free.
 
@@ -133,7 +133,7 @@ def run_on_cluster(
 def _bounded(function: Callable[..., Result], limit: float, name: str, *task: Any) -> Result | Status:
     """Call a function on one thread of a worker process; end the process if the call takes longer than `limit` [s].
 
-    Nothing else can stop a simulator. An event on the scheduler tells the next worker of this task that it was late.
+    Nothing else can stop a simulator. An event on the scheduler tells the next worker that the task was late.
     """
     from distributed import Event
 

@@ -14,14 +14,14 @@ from torchgrasp.errors import ModelFileError, Status
 from torchgrasp.files import begin_folder, format_json, hold_folder, remove_file, sha256, write_file
 
 ASKED, README, PARTS = "campaign.json", "README.md", "parts"
-"""What was asked; the card for people; the folder of jobs whose shard is not whole yet."""
+"""Names in a campaign's folder: its request, its text for people, and the folder for jobs of incomplete shards."""
 ROUNDS = 3
-"""How often a job whose process died is tried in one call, and twice each time: the innocent die with the guilty."""
+"""How often a job whose process died is tried in one call, because a dying process also ends jobs beside its own."""
 FAILED = (Status.WORKER_DIED, Status.TIMED_OUT, Status.BROKEN)
-"""Ends of a job that say nothing about its object: the next call tries it again."""
+"""Statuses of a failed job that say nothing about its object: the next call tries the job again."""
 
 Work = Callable[[Sequence[int]], Generator[tuple[int, bytes | Status], None, None]]
-"""Takes numbers of jobs; yields, as they end, place among these and file of each, or how its process ended."""
+"""Takes indices of jobs. As each job ends, it yields a position in these indices and a file, or a process failure."""
 FIELDS = (
     ("points", "p x 3", "cloud of each job, one behind the other [m]"),
     ("viewpoints", "j x 3", "position of the camera [m]; zeros: unknown"),
@@ -40,13 +40,13 @@ FIELDS = (
     ("grasps.status", "g", "0: executable; all are"),
     ("passed, outcome", "g x d", "verdict of each try in the simulator, and its Status"),
 )
-"""Tensors of a shard: name, shape and meaning."""
+"""The tensors in a shard file: name, shape and meaning of each."""
 
 
 class Campaign(NamedTuple):
     """The request of a campaign, as in `campaign.json`, and one row for each job.
 
-    A row whose status is not OK needs no work.
+    A row whose status is not OK needs no work. `empty` makes the data of a job without grasps from its row.
     """
 
     asked: dict[str, Any]
@@ -68,7 +68,7 @@ class Campaign(NamedTuple):
 def carry_out(
     campaign: Campaign, folder: Path, work: Work, observer: Callable[[JobRow], object] = lambda row: None
 ) -> GraspShards:
-    """Run all jobs that a folder lacks, and complete its data set; the observer is called with each finished job's row.
+    """Run the jobs that are not yet in a folder, and write its data set; the observer gets each finished job's row.
 
     Raises:
         OutputError: the folder holds another campaign or other files, another run holds it, or it cannot be written.
@@ -102,7 +102,7 @@ def carry_out(
 
 
 class _Store:
-    """The files of a campaign; `rows` holds the rows of all jobs that are on disk and undamaged."""
+    """The files of a campaign; `rows` holds, by index, the rows of all jobs that are undamaged on disk."""
 
     def __init__(self, campaign: Campaign, folder: Path) -> None:
         self.campaign, self.folder = campaign, folder
@@ -120,14 +120,14 @@ class _Store:
         return [j for j in range(len(self.campaign.rows)) if j not in self.rows]
 
     def put(self, j: int, data: bytes) -> JobRow:
-        """Write the file of a finished job; return its row."""
+        """Write the file content `data` of the finished job j to disk; return the job's row."""
         (shard,) = self._load(write_file(self._part(j), data), [j])
         self.rows[j] = shard.rows[0]._replace(meta={})
         self._close(j // self.size)
         return self.rows[j]
 
     def finish(self) -> None:
-        """Write both cards, the JSON card last, and remove the folder of single jobs."""
+        """Write the README, then `card.json`, which marks a complete data set; remove the folder of single jobs."""
         rows = [self.rows[j] for j in range(len(self.campaign.rows))]
         card = card_of(self.campaign, rows, [self.digests[k] for k in self.shards])
         write_file(self.folder / README, describe(card))
@@ -136,7 +136,7 @@ class _Store:
             (self.folder / PARTS).rmdir()
 
     def _find(self, k: int) -> dict[int, Shard]:
-        """Return the undamaged jobs of shard k: each from its own file, or from the shard's file."""
+        """Return the undamaged jobs of shard k by index, read from the file of the job or of the shard."""
         jobs, found = self._jobs(k), dict[int, Shard]()
         with contextlib.suppress(ModelFileError):
             found = dict(zip(jobs, self._load(shard_path(self.folder, k), jobs), strict=True))
@@ -146,7 +146,7 @@ class _Store:
         return found
 
     def _close(self, k: int) -> None:
-        """Write shard k if all of its jobs have finished, and remove their own files."""
+        """If all jobs of shard k have finished, write the shard file and remove the files of the single jobs."""
         path, jobs = shard_path(self.folder, k), self._jobs(k)
         if any(j not in self.rows for j in jobs):
             return
@@ -166,7 +166,7 @@ class _Store:
         return self.folder / PARTS / f"job-{j:06d}.safetensors"
 
     def _load(self, path: Path, jobs: Sequence[int]) -> list[Shard]:
-        """Read the jobs of a file one by one; raise `ModelFileError` unless they are the given jobs."""
+        """Return the jobs in a file, one shard for each job; raise `ModelFileError` unless they are the given jobs."""
         shard = load_shard(path, self.campaign.meta)
         held = [(row.object, row.view) for row in shard.rows]
         if held != (asked := [(self.campaign.rows[j].object, self.campaign.rows[j].view) for j in jobs]):
@@ -197,7 +197,7 @@ def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> d
 
 
 def describe(card: dict[str, Any]) -> str:
-    """Return the card as Markdown, with the header that data set hubs read."""
+    """Return the content of `card.json` as a README in Markdown, with the header that data set hubs read."""
     asked, counts = card["asked"], card["counts"]
     hand, protocol, trials = asked["hand"], asked["protocol"], asked["trials"]
     reasons = "\n".join(f"| {name.lower()} | {n} | {Status[name].sentence} |" for name, n in counts["status"].items())
@@ -248,5 +248,5 @@ p points, j jobs, g grasps, d tries of a grasp, h joints ({hand["joint_names"]})
 
 
 def _quoted(text: str) -> str:
-    """Return a text as a YAML value for the header."""
+    """Return a text as a YAML value for the header of the README."""
     return text.lower() if text.replace("-", "").replace(".", "").isalnum() else '"' + text.replace('"', "'") + '"'

@@ -129,7 +129,7 @@ def run_campaign(
 
 
 def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:
-    """Return one row for each view of each object, in order; a single row for an object with a bad entry."""
+    """Return one row for each job (a view of an object), in order; an object with a bad entry gives a single row."""
     rows: list[JobRow] = []
     for name, entry in read_entries(objects, spec.trials.only).items():
         if isinstance(entry, DatasetError):

@@ -35,7 +35,7 @@ MESHES = (".ply", ".stl", ".obj", ".off")  # suffixes of the meshes that `write_
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEntry:
-    """An object's entry in the manifest.
+    """The description of an object in the manifest of a folder of objects.
 
     Args:
         views: position [m] of the camera of each view by name, at scale 1.
@@ -52,7 +52,7 @@ class ObjectEntry:
     mass: float | None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
-        """Return the sorted names of the views, at most `most`; with `whole` only the view `WHOLE`."""
+        """Return the sorted names of at most `most` views; with `whole` only the view `WHOLE`, from all sides."""
         return ([WHOLE] if whole else sorted(self.views))[:most]
 
 
@@ -106,7 +106,7 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
 
 @checked
 def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0) -> list[str]:
-    """Make a folder of objects from a folder of mesh files; return the objects' names, those of the files.
+    """Make a folder of objects from a folder of mesh files; return the objects' names, which are the file names.
 
     Each mesh is moved so that its lowest point is at z = 0 and the middle of its box above the origin. Each view is
     rendered by the depth camera of `partial_view` from a random side. The manifest is written last, so that a folder
@@ -170,7 +170,7 @@ def list_views(
 ) -> list[tuple[str, str]]:
     """Return sorted pairs of object and view, at most `most` views of each object, by default all.
 
-    `only` selects objects; with `whole` each object has the single view `WHOLE`.
+    `only` selects objects by name; with `whole` each object has the single view `WHOLE`, which shows all sides.
 
     Raises:
         DatasetError: no manifest, none of the objects in it, or a bad entry.
@@ -188,7 +188,7 @@ def list_views(
 
 @checked
 def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
-    """Return the point cloud of a noisy view without normals, with its viewpoint if `camera`.
+    """Return the point cloud of a noisy view without normals, with the position of the camera if `camera` is true.
 
     Raises:
         DatasetError: as `read_entry`, or no such view.
@@ -236,7 +236,7 @@ def _file(objects: Path | str, name: str, file: str) -> Path:
 
 
 def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
-    """Return the manifest's entries of the objects in `only`, or of all objects if `only` is empty."""
+    """Return the unchecked manifest entries, by name, of the objects in `only`; an empty `only` selects all."""
 
     def refuse(found: str, allowed: str) -> DatasetError:
         return DatasetError("objects", found, allowed)

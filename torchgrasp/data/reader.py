@@ -76,7 +76,7 @@ class GraspShards:
 
         Raises:
             IndexError: no such grasp.
-            ModelFileError: its shard is damaged.
+            ModelFileError: the file of the shard with the grasp is damaged.
         """
         i = range(len(self))[operator.index(i)]
         j = bisect.bisect_right(self.starts, i) - 1
@@ -99,7 +99,7 @@ class GraspShards:
 
         Raises:
             IndexError: no such job.
-            ModelFileError: its shard is missing, damaged, or belongs to another campaign.
+            ModelFileError: the file of its shard is missing, damaged, or belongs to another campaign.
         """
         j = range(len(self.jobs))[j]
         row, records = self.recent.get(j // self.size, self._read).take(j % self.size)
@@ -109,7 +109,7 @@ class GraspShards:
         return ShardJob(row[0], cloud, grasps, records.passed, records.outcome)
 
     def _read(self, k: int) -> Shard:
-        """Read shard k, and check its rows against the card."""
+        """Read shard k, and check that its rows are those in `card.json`."""
         path = shard_path(self.folder, k)
         shard = load_shard(path, {"campaign": str(self.card["campaign"])})
         bare = tuple(row._replace(meta={}) for row in shard.rows)
@@ -119,7 +119,7 @@ class GraspShards:
 
 
 def shard_path(folder: Path, k: int) -> Path:
-    """Return the path of shard k."""
+    """Return the path of the file of shard k in a data set."""
     return folder / f"shard-{k:06d}.safetensors"
 
 

@@ -65,7 +65,7 @@ class Records(Value):
 
 
 class Shard(NamedTuple):
-    """The rows of several jobs, and their records."""
+    """The content of a shard file: the rows of several jobs, and the tensors of all these jobs."""
 
     rows: tuple[JobRow, ...]
     records: Records
@@ -80,13 +80,13 @@ class Shard(NamedTuple):
 
 
 def join_shards(parts: Sequence[Shard]) -> Shard:
-    """Concatenate the jobs of several shards."""
+    """Return one shard with the jobs of several shards, in order."""
     records = map_tensors(lambda *tensors: torch.cat(tensors), *(part.records for part in parts))
     return Shard(tuple(itertools.chain(*(part.rows for part in parts))), records)
 
 
 def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
-    """Return the bytes of a shard's file; `meta` identifies the campaign."""
+    """Return the bytes of the file of a shard; `meta` becomes metadata that identify the campaign."""
     jobs = json.dumps([row.as_json() for row in shard.rows])
     return pack_tensors(KIND, named_tensors(shard.records), {**meta, "jobs": jobs})
 
@@ -128,6 +128,6 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
 
 
 def short(text: str) -> str:
-    """Return a text on one line, cut to the length that readers of rows accept."""
+    """Return a text on one line, cut to the largest length that `read_row` accepts."""
     line = " ".join(text.split())
     return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."

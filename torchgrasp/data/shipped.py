@@ -27,7 +27,7 @@ GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspObject:
-    """An object to grasp, in metres, z up, resting at z = 0, with its mass [kg].
+    """An object to grasp with its mass [kg]; all lengths are in metres, and the object rests at z = 0 with z up.
 
     `mesh` is the true, closed surface. In simulation the convex `parts`, whose union is the object, are used. `view` is
     a noisy point cloud from one side, with its viewpoint.
@@ -97,7 +97,7 @@ def load_shipped_grasp(name: str, hand: str) -> Grasps:
 
 
 def load_scene() -> Scene:
-    """Return a rendered scene of the shipped objects on a table, with noise and true labels; z is up.
+    """Return a scene of the shipped objects on a table: a rendered, noisy depth image with true labels; z is up.
 
     >>> load_scene().things
     (1, 2, 3, 4)

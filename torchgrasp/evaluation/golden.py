@@ -18,7 +18,7 @@ from torchgrasp.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A shipped grasp of a shipped object; `held` is the expected verdict."""
+    """A shipped grasp of a shipped object; `held` says whether the simulated hand should hold the object."""
 
     object: str
     hand: str
@@ -30,7 +30,7 @@ GOLDEN = (
     GoldenCase("cylinder", "allegro", False),
     GoldenCase("jug", "barrett", False),
 )
-"""Two hands, two objects, both verdicts."""
+"""The test cases: grasps of two hands on two objects, some of which hold the object."""
 
 
 class GoldenResult(NamedTuple):

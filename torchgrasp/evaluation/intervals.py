@@ -33,7 +33,7 @@ class Share(NamedTuple):
 
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
-    """Return passed and total trials for each unit, given pairs of unit name and outcome."""
+    """Return the numbers of passed and of all trials for each unit, given pairs of unit name and outcome."""
     return {name: (int(passed), total) for name, (passed, total) in _sum_by(outcomes).items()}
 
 
@@ -48,7 +48,7 @@ def _sum_by(values: Iterable[tuple[str, int | float]]) -> dict[str, tuple[int | 
 
 @checked
 def share_over(counts: Counts, seed: Seed = 0) -> Share:
-    """Return the success rate over all trials, with its interval over the units.
+    """Return the success rate over all trials, with its 95 % interval from resampling the units.
 
     If all trials passed, or none, the bootstrap has no width. The interval is then the one-sided 95 % bound of n
     independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
@@ -62,13 +62,13 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
 @checked
 def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
-    """Return the mean of values, with its interval over units, given pairs of unit name and value; NaN is left out."""
+    """Return the mean, with its 95 % interval, of values given as pairs of unit name and value; NaN is left out."""
     return contrast_over([_sum_by((name, x) for name, x in values if not math.isnan(x))], [1.0], seed)
 
 
 @checked
 def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
-    """Return the first success rate minus the second, with an interval paired by unit.
+    """Return the first success rate minus the second, with a 95 % interval; both rates use the same resampled units.
 
     An interval of zero width means that the units agree, not that the difference is exact.
     """
@@ -77,9 +77,10 @@ def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
 
 @checked
 def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
-    """Return a weighted sum of success rates, with its interval over common resampled units.
+    """Return a weighted sum of success rates, with a 95 % interval; all rates use the same resampled units.
 
-    `total` counts the trials of the first column. Resamples in which a column has no trial are left out.
+    Each of `columns` holds the counts of one rate. `total` counts the trials of the first column. Resamples in which a
+    column has no trial are left out.
     """
     resamples = 10_000  # number of resamples behind an interval
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
@@ -99,7 +100,7 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
 
 
 def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[Tensor, "*r"]:
-    """Return the weighted sum of the columns' success rates; NaN where a column has no trial."""
+    """Return the weighted sum of c success rates, given passed and all trials of each; NaN if a rate has no trial."""
     return (sums[..., 0] / sums[..., 1]) @ sums.new_tensor(weights)
 
 

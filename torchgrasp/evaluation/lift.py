@@ -99,7 +99,7 @@ def close_hand(
 @checked
 @single_threaded
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
-    """Run a lift trial; see `close_hand`."""
+    """Run one trial: close the hand, lift the object and hold it, as `close_hand` explains."""
     return run_lift(TrialDriver(trial, TrialSpec() if spec is None else spec))
 
 
@@ -120,7 +120,7 @@ class _Tick(Value):
     """The simulated state at one control tick, or with a leading axis the states at all ticks.
 
     `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `felt` holds the controller's
-    estimates of friction and load.
+    estimates of friction and load [N], `truth` the true contacts.
     """
 
     time: Float[Tensor, "*t"]
@@ -177,7 +177,7 @@ class _Lift:
         return self._verdict()
 
     def _put_down(self, time: float, rising: float) -> Status:
-        """Lower the hand in as much time [s] as it has risen; return the status of a load that is too heavy."""
+        """Lower the hand for as long as it rose; return `TOO_HEAVY`, or `DROPPED` if the object is then elsewhere."""
         height, _ = self._height(time, rising)
         ticks = self.run.robot.ticks(min(time, rising))
         for k in range(ticks):

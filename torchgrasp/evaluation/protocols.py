@@ -1,4 +1,4 @@
-"""Test protocols of grasps: lifts, and published pulls at the object's centre of mass without table and gravity."""
+"""Settings of the trials that test grasps: lifts, and published pulls at the object without table and gravity."""
 
 import dataclasses
 import hashlib
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """Uniform pose errors along and about each axis, at most [m, rad]; `draws` is their number for each grasp."""
+    """Random pose errors of at most `translation` [m] along and `rotation` [rad] about each axis; `draws` per grasp."""
 
     translation: Length = 0.0
     rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
@@ -34,7 +34,7 @@ class PoseNoise(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """A pull, as force over mass [m/s^2] for some seconds, and the largest allowed motion of the object [m, rad]."""
+    """A pull with the force mass x `acceleration` [m/s^2], and the largest motion [m] and rotation [rad] that pass."""
 
     acceleration: Annotated[float, Range(0.0, 1000.0)]
     seconds: Annotated[float, Range(0.0, 60.0)]
@@ -45,9 +45,9 @@ class PullSpec(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """A test protocol of grasps: trials that pull at the object, or that lift it.
+    """The settings of the simulated trials that test a grasp: they pull at the object, or lift it if `pull` is None.
 
-    In pulls `noise` displaces the hand, in lifts the object.
+    `noise` displaces the hand in pulls, and the object in lifts.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Protocol(Value):
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":
-        """Return the protocol with fields of its trial changed.
+        """Return the protocol with some settings of its trial changed.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'
@@ -69,7 +69,7 @@ _FLOATING = TrialSpec(
     closing="open_loop", force=7.0, mass=0.1, friction=0.6, patch=0.02 / 0.6, kp=5.0, overlap=0.01,
     gravity=0.0, table=False, approach=0.0, lift_height=0.0,
 )  # fmt: skip
-"""DexGraspBench's. PhysX resists torsion by friction x force x patch [m]: the ratio of both frictions."""
+"""DexGraspBench's trial. PhysX resists torsion by friction x force x patch [m], the ratio of both frictions."""
 
 _PULL = PullSpec(10.0, 2.0, 0.05, math.radians(15))  # DexGraspBench's
 
@@ -91,7 +91,7 @@ PROTOCOLS = {
         Protocol("household", TrialSpec(shake=0.003, force=6.0)),
     )
 }
-"""By name.
+"""The protocols by name.
 
 * multidex: MultiDex as D(R,O) runs it (arXiv 2410.01702).
 * dexgraspbench: force closure for floating objects (as of BODex, arXiv 2412.16490).
@@ -159,13 +159,13 @@ def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count,
 
 
 def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tensor, "4 4"]:
-    """Return the hand's pose error that is equivalent to a displacement of the object."""
+    """Return the pose error of the hand that is equivalent to a displacement of the object by `object_pose`."""
     return inverse(obj_from_hand) @ inverse(object_pose) @ obj_from_hand
 
 
 @checked
 def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed) -> Float[Tensor, "4 4"]:
-    """Return the random pose error of the hand for one trial of a grasp, with its own seed (`seed_of`)."""
+    """Return the random pose error of the hand for one trial of a grasp; `seed_of` gives the seed of the trial."""
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
     pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)

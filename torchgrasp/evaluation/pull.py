@@ -20,16 +20,17 @@ from torchgrasp.geometry.frames import rotation_angle
 from torchgrasp.threads import single_threaded
 
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
-"""-x, +x, -y, +y, -z, +z of the world."""
+"""Directions of the pulls: -x, +x, -y, +y, -z, +z of the world."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """The result of a pull trial: whether the object stayed in all directions, and its largest motion [m, rad].
+    """The result of a pull trial: whether the object stayed in the hand when pulled in each direction.
 
-    `status` is that of the last of the `directions` that were tried. `force` [N] is the fingers' mean normal force
-    before the first pull, or NaN. `seconds` is CPU time.
+    `directions` is the number of pulls that were tried, `status` that of the last one. The object's largest motion is
+    `moved` [m] and `turned` [rad]. `force` [N] is the fingers' mean normal force before the first pull, or NaN.
+    `seconds` is CPU time.
     """
 
     passed: bool
@@ -103,7 +104,7 @@ def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status,
 
 
 def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.ndarray]:
-    """Return whether the object's motion is allowed, as a status, and the motion [m, rad] from its start."""
+    """Return `OK` or a failure if the object has moved too far, and the object's motion [m, rad] from the start."""
     pose, centre = run.scene.object_pose(), np.append(run.scene.centre, 1.0)
     if not np.isfinite(pose).all():
         return Status.UNSTABLE, np.full(2, math.inf)
@@ -120,7 +121,7 @@ def run_protocol(
     rank: Annotated[int, Range(0, 1000000)] = 0,
     draw: Annotated[int, Range(0, 1000000)] = 0,
 ) -> ProtocolResult:
-    """Run one trial of a grasp under a protocol; see `pull_grasp` and `lift_grasp`."""
+    """Run one trial of a grasp, pulls or a lift; the result stores the grasp's `rank` and the pose error's `draw`."""
     started = time.process_time()
     driver = TrialDriver(trial, protocol.trial)
     overlap = driver.grasp_overlap()

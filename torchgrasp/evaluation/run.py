@@ -40,7 +40,7 @@ def evaluate(
         objects: a folder as in `torchgrasp.data`.
         hand: the hand that grasps.
         protocol: a protocol or its name in `PROTOCOLS`.
-        spec: views and grasps; `EvaluationSpec()` by default.
+        spec: which views and grasps are tried; `EvaluationSpec()` by default.
         folder: folder for the executable grasps of each view, OBJECT/VIEW.safetensors; by default a temporary folder.
             No other run may write to it at the same time.
         workers: number of worker processes; the scores do not depend on it.
@@ -80,7 +80,7 @@ def _evaluate(
     folder: Path | None,
     workers: int,
 ) -> Generator[ViewScore, None, None]:
-    """Yield the scores of all views; `evaluate` has checked the arguments."""
+    """Plan on and try all views, and yield their scores; `evaluate` has checked the arguments."""
     yield from refused
     with contextlib.ExitStack() as stack:
         shelf = stack.enter_context(temporary_folder()) if folder is None else Path(folder)
@@ -102,7 +102,7 @@ def _evaluate(
 
 
 def _plan(view: View, shelf: Path, friction: float, spec: EvaluationSpec) -> ViewScore:
-    """Plan grasps on a view and save them, or count the grasps of an earlier call."""
+    """Plan grasps on a view and save them in the folder `shelf`, or count the grasps that an earlier call saved."""
     found = plan_view(view, friction, spec, view.file(shelf) if spec.planned else None)
     if found.grasps is not None and not spec.planned:
         meta = found.grasps.meta | {REFUSAL: found.score.refusal.name}
@@ -111,5 +111,5 @@ def _plan(view: View, shelf: Path, friction: float, spec: EvaluationSpec) -> Vie
 
 
 def _try(view: View, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
-    """Try one of the saved grasps of a view."""
+    """Try the saved grasp with index `row` of a view in simulation, with the pose error of number `draw`."""
     return try_grasp(view, load_grasps(view.file(shelf))[row], protocol, spec, (row, draw))

@@ -88,7 +88,7 @@ class ViewScore(Value):
 
     @property
     def unit(self) -> str:
-        """The unit that the bootstrap resamples: the object's family, or the object if it has none."""
+        """The unit that confidence intervals resample: the object's family, or the object if it has no family."""
         return self.family or self.object
 
 
@@ -138,7 +138,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
 
 
 def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
-    """Return success rates and counts of some views."""
+    """Return the success rates of some views, and their numbers of refusals and executable grasps, by name."""
     draws = 1 + max((attempt.draw for score in scores for attempt in score.attempts), default=0)
     tried = [(score.unit, attempt) for score in scores for attempt in score.attempts]
     best = [(unit, attempt.passed) for unit, attempt in tried if attempt.rank == 0]
@@ -190,7 +190,7 @@ class Bin(NamedTuple):
 def judge(
     predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]
 ) -> dict[str, float | list[Bin]]:
-    """Return calibration measures of predicted probabilities, given the outcomes; intervals resample `units`.
+    """Return calibration measures of predicted probabilities, given the outcomes; `units` names each trial's family.
 
     "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect predictions and 0
     for always predicting the mean. "auc" is the area under the ROC curve. "error" is the expected calibration error
@@ -211,7 +211,7 @@ def judge(
 
 
 def _bins(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]) -> list[Bin]:
-    """Return the non-empty of ten calibration bins of equal width."""
+    """Return those of ten calibration bins of equal width that hold a prediction."""
     at, bins = (predicted * 10).long().clamp(0, 9), []
     for k in at.unique().tolist():
         rows: list[int] = torch.nonzero(at == k)[:, 0].tolist()
@@ -231,7 +231,7 @@ def _area_under_curve(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"]) 
 
 @checked
 def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
-    """Return whether the finger with the most certain contact touched first, as Sec. 5 expects of Eq. (27)."""
+    """Return whether the finger with the most certain contact touched first, as the paper expects (Sec. 5, Eq. 27)."""
     check_single(grasp)
     std_m = grasp.contacts.require_std()[0]
     return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())

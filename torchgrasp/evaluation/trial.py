@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """The input of a trial: a grasp and the true object; fields as the arguments of `close_hand`."""
+    """The input of a trial: a grasp and the true object; the fields are the arguments of `close_hand`."""
 
     hand: Hand
     grasp: Grasps
@@ -86,7 +86,7 @@ class TrialDriver:
         self.scene_spec = self._scene_spec(hand, grasp, body)
 
     def _scene_spec(self, hand: Hand, grasp: Grasps, body: Body) -> SceneSpec:
-        """Return the parameters of the scene; the hand's true pose includes the trial's pose error."""
+        """Return the parameters of the simulated scene; the hand's true pose in it includes the trial's pose error."""
         spec, trial, drives = self.spec, self.trial, hand.actuators
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
@@ -103,7 +103,7 @@ class TrialDriver:
         )  # fmt: skip
 
     def _body(self, given: "Solid", parts: "Sequence[trimesh.Trimesh] | None", mass: float | None = None) -> Body:
-        """Return a body in the simulator's frame, with its convex parts."""
+        """Return a mesh as a body of the scene: in the simulator's frame, with its convex parts and its mass [kg]."""
         mesh, parts = read_solid(given, parts)
         if mass is None:
             mass = self.spec.mass if self.spec.density is None else self.spec.density * float(mesh.volume)
@@ -124,7 +124,7 @@ class TrialDriver:
 
 
 def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingReference:
-    """Return the closing plan of a trial; for closing "paper" the stability model [6], if any, gives the forces."""
+    """Return the closing plan of a trial; for closing "paper" the hand's stability model, if any, gives the forces."""
     stability = None
     if spec.closing == "paper":
         hand.require_three("closing", "'paper', whose model of stability is of three,")
@@ -152,7 +152,7 @@ class TrialRun:
         return self.overlap <= self.spec.overlap
 
     def approach(self) -> Iterator[None]:
-        """Move the opened hand straight to its pre-grasp, with contact stops or in one motion."""
+        """Move the opened hand straight to its pre-grasp; if the approach is guarded, a touch stops the hand."""
         speed = 0.2  # mean speed [m/s] of an unguarded approach
         if self.controller.approaching:
             self.observation = self.robot.tick(self.controller.targets)
@@ -200,14 +200,15 @@ class TrialRun:
 
 
 def smooth_step(time: float) -> tuple[float, float]:
-    """Return position and speed of a smooth motion from 0 to 1, at a time in [0, 1]."""
+    """Return position and speed, at a `time` in [0, 1], of a motion from 0 to 1 that starts and ends at rest."""
     return time * time * (3 - 2 * time), 6 * time * (1 - time)
 
 
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return `obj_from_world`: the table at z = 0, the hand above the origin, x along the hand's x axis.
+    """Return the pose of the simulator's frame in the frame of the grasp.
 
-    If the hand's x axis is steeper than 60 degrees, x is along its y axis.
+    The table is at z = 0, the hand above the origin. The x axis is along the hand's x axis, or along the hand's y axis
+    if the former is steeper than 60 degrees.
     """
     z, origin = unit(table.normal.double()), obj_from_hand[:3, 3]
     level = [axis - (axis @ z) * z for axis in obj_from_hand[:3, :2].unbind(-1)]
@@ -216,7 +217,7 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
 
 
 def _to_world(grasp: Grasps, obj_from_world: Float[Tensor, "4 4"]) -> Grasps:
-    """Return a grasp in the simulator's frame, with rounded numbers."""
+    """Return a grasp, converted to the simulator's frame, with rounded numbers."""
     world_from_obj = inverse(obj_from_world)
 
     def turn(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
@@ -235,7 +236,7 @@ def _rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
 
 def _moved(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
-    """Return a mesh in the simulator's frame, with vertices rounded to `GRID`."""
+    """Return a mesh, converted to the simulator's frame, with vertices rounded to multiples of `GRID`."""
     import trimesh
 
     vertices = to_upright(torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)), obj_from_world)

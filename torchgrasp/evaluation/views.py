@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
 
 Ranks = Literal["best", "spread"]
-"""Which grasps of a view are tried: the best, or as many spread over all ranks."""
+"""Which grasps of a view are tried: the best grasps, or the same number of grasps spread over all ranks."""
 
 
 @checked
@@ -76,7 +76,7 @@ class EvaluationSpec(Value):
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the ranks of the grasps to try, at most `most`."""
+    """Return the indices of the grasps to try: at most `most` of the `executable` grasps, which are in ranked order."""
     most = min(most, executable)
     if ranks == "best" or most < 2:
         return list(range(most))
@@ -94,7 +94,7 @@ class View:
 
     @property
     def score(self) -> ViewScore:
-        """The score of the view before planning."""
+        """The result for the view before planning: names of object, view, family and group, but no grasps."""
         entry = read_entry(self.objects, self.object)
         return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
 
@@ -108,7 +108,7 @@ class View:
 
 
 class PlannedView(NamedTuple):
-    """The result of planning on a view: score, cloud and executable grasps; None if the object is refused."""
+    """The result of planning on a view: score, cloud and executable grasps; the latter are None for a bad object."""
 
     score: ViewScore
     cloud: PointCloud | None = None

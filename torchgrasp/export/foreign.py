@@ -36,7 +36,7 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """Imported grasps: joints [rad], poses of the hand's root link in the object's frame, pre-grasp if known."""
+    """Imported grasps: joints [rad], poses of the hand's root link in the object's frame, pre-grasp joints if known."""
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Float[Tensor, "g 4 4"]
@@ -141,7 +141,7 @@ def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quat
 
 
 def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
-    """Return the position of each actuated joint in a file's joint order."""
+    """Return the index in a file's joint order of each actuated joint; refuse an order that lacks one."""
     missing = [name for name in hand.joint_names if name not in order]
     if missing or len(set(order)) != len(order):
         found = f"{len(order)} names without {', '.join(missing[:4])}" if missing else "a name twice"
@@ -150,7 +150,7 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
 
 
 def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
-    """Return pose matrices from positions and quaternions (g, 7)."""
+    """Return pose matrices from rows (g, 7) of a position [m] and a unit quaternion in the given order."""
     from scipy.spatial.transform import Rotation
 
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
@@ -183,7 +183,7 @@ def grasps_from_joints(
         joints: actuated joints [rad], in the order of `hand.joint_names`.
         obj_from_hand: poses of the root link of the hand's URDF.
         pregrasp: joints of the opened hand; by default each tip moves 20 mm off its contact, or as far as limits allow.
-        spec: friction and edges of the certificate; `ContactSpec()` by default.
+        spec: friction and number of cone edges of the certificate; `ContactSpec()` by default.
         std_m: standard deviation [m] of the surface at each contact, for closing controllers that use it.
 
     Raises:
@@ -216,7 +216,7 @@ def grasps_from_joints(
 
 
 def _open(hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]) -> Float[Tensor, "g h"]:
-    """Return joints at which the fingertips are moved off their contacts along the normals, within the limits."""
+    """Return joints at which each fingertip has moved 20 mm off its contact along `away`, if joint limits allow."""
     opening, steps = 0.02, 4  # distance [m], and linear steps, which reach it within 1 mm
     for _ in range(steps):
         jacobian = hand.jacobian(joints).flatten(1, 2)

@@ -25,7 +25,7 @@ from torchgrasp.shape.surface import Surface
 from torchgrasp.values import Grasps
 
 BENCH_HANDS = {"allegro": ([1.0, 0.0, 1.0, 0.0], tuple(f"joint_{k}" for k in range(16)))}
-"""Hands of the bench: rotation (x, y, z, w) of our root link in the frame that it moves, our joints in its order."""
+"""Hands that DexGraspBench has: rotation (x, y, z, w) of the root link in its hand frame, and joints in its order."""
 
 
 @checked
@@ -39,7 +39,7 @@ def save_dexgraspbench(
 ) -> list[Path]:
     """Write each grasp as a file `folder/0.npy`, `folder/1.npy` and so on, for DexGraspBench's evaluator.
 
-    A file is a dictionary: `obj_path`, `obj_scale` (1), `obj_pose` (none), and `pregrasp_qpos`, `grasp_qpos`,
+    A file is a dictionary: `obj_path`, `obj_scale` (1), `obj_pose` (identity), and `pregrasp_qpos`, `grasp_qpos`,
     `squeeze_qpos` (23): position [m] and quaternion (w, x, y, z) of the hand, then 16 joints [rad]. The evaluator only
     accepts a pickled dictionary; ours holds only arrays, numbers and a text.
 
@@ -103,7 +103,7 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
 
 def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
-    """Return `bench_from_root` and the order of joints of DexGraspBench; identity and () for a hand that it lacks."""
+    """Return the root link's pose in DexGraspBench's hand frame, and its joint order; identity and () if not known."""
     from scipy.spatial.transform import Rotation
 
     turn, order = BENCH_HANDS.get(hand.name, ([0.0, 0.0, 0.0, 1.0], ()))
@@ -159,7 +159,7 @@ def largest_std(surface: Surface) -> float:
 
 @checked
 def check_surface_path(path: Path | str) -> Path:
-    """Return the path if `save_surface` can write its format; raise `BadArgument` for other suffixes.
+    """Return the path if `save_surface` can write a file with its suffix; otherwise raise `BadArgument`.
 
     >>> check_surface_path("a.glb").suffix
     '.glb'

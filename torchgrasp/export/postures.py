@@ -31,7 +31,7 @@ CONVENTIONS = {
     "squeeze": "targets of position-controlled joints: stiffness (squeeze - grasp) = torque = J^T force",
     "force": "of the fingertip on the object at its contact, in the object's frame",
 }
-"""Meaning of the numbers; the file contains it."""
+"""Meaning of the numbers in a JSON file of grasps; the file contains this text."""
 
 
 @checked
@@ -101,7 +101,7 @@ def format_grasps(
 def named_postures(
     hand: Hand, grasps: Grasps, force: float, kp: float | None
 ) -> tuple[Squeeze, dict[str, dict[str, Float[Tensor, "g"]]]]:
-    """Return the squeeze of grasps, and all joints [rad] by name in "pregrasp", "grasp" and "squeeze", on the CPU."""
+    """Return pressing targets and forces, and the joints [rad] by name of "pregrasp", "grasp" and "squeeze" (CPU)."""
     hand, grasps = hand.to("cpu"), grasps.to("cpu")
     squeezed = squeeze(hand, grasps, force, kp)
     postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}

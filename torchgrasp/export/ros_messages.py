@@ -17,18 +17,18 @@ from torchgrasp.ik.motion import APPROACH_DISTANCE
 from torchgrasp.values import Grasps
 
 OBJECT_FRAME = "object"
-"""Name of the object's frame in the messages: the frame of the cloud; publish a transform of that name."""
+"""Name in the messages of the object's frame, which is the frame of the cloud; publish a transform of that name."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes numbers with nine decimals [nm, nrad]: YAML 1.1 takes 1e-05 for a text, so none has an exponent."""
+    """Writes YAML with nine decimals and no exponent in each number, because YAML 1.1 reads 1e-05 as a text."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write equal lists anew."""
+        """Return True, so that a list that occurs twice is written twice instead of as a reference."""
         return True
 
     def represent_number(self, number: float) -> yaml.ScalarNode:
-        """Return a float as a scalar of YAML."""
+        """Return a float as a YAML number without an exponent."""
         return self.represent_scalar("tag:yaml.org,2002:float", f"{number:.9f}" if math.isfinite(number) else ".nan")
 
 
@@ -41,7 +41,7 @@ def format_moveit(
 ) -> str:
     """Return grasps as a YAML list of moveit_msgs/Grasp.
 
-    `grasp_pose` is that of the root link of the hand's URDF in `OBJECT_FRAME`: attach the end-effector there. The
+    `grasp_pose` is the pose of the root link of the hand's URDF in `OBJECT_FRAME`: attach the end-effector there. The
     pre-grasp posture has positions; the grasp posture closes to the contacts, then to targets that press, with the
     torques [N m] as effort. `grasp_quality` is the predicted success. The retreat is opposite to the approach. `force`
     [N] is the normal force of the strongest finger. `kp` is the stiffness of the robot's own position control [N
@@ -111,7 +111,7 @@ def _trajectories(hand: Hand, grasps: Grasps, force: float, kp: float | None) ->
 
 
 def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
-    """Return a geometry_msgs/Pose."""
+    """Return a pose as a geometry_msgs/Pose, a dictionary."""
     w, x, y, z = quaternion(obj_from_hand)
     position = dict(zip("xyz", obj_from_hand[:3, 3].tolist(), strict=True))
     return {"position": position, "orientation": {"x": x, "y": y, "z": z, "w": w}}
@@ -125,7 +125,7 @@ def _translation(direction: Float[Tensor, "3"]) -> dict[str, Any]:
 
 
 def _document(hand: Hand, what: str, documents: Iterable[Any]) -> str:
-    """Return plain values as YAML, below comment lines that explain the numbers."""
+    """Return one YAML text of all documents, below comment lines that say `what` they are and explain the numbers."""
     root, file = read_urdf(hand.urdf_path).root, hand.urdf_path.name
     heading = (
         f"# {what}, for the {hand.name} hand, by torchgrasp\n"
