@@ -1,7 +1,7 @@
-"""Rigid transforms, and the virtual frame of three contacts (Eqs. 15-17).
+"""Rigid transforms, and the virtual frame of three contacts, Eqs. (15)-(17) of the paper.
 
 A transform `a_from_b` maps coordinates of frame b into frame a. Products therefore chain adjacent names:
-`obj_from_hand = obj_from_vf @ vf_from_hand` (Eq. 24).
+`obj_from_hand = obj_from_vf @ vf_from_hand`, Eq. (24) of the paper, with the virtual frame vf.
 """
 
 import itertools
@@ -16,7 +16,7 @@ from torchgrasp.geometry.linalg import unit
 
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the homogeneous transform of a rotation and a translation [m]."""
+    """Return the homogeneous 4 x 4 transform with a given rotation and translation [m]."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3]
     return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
@@ -29,17 +29,17 @@ def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
 
 
 def apply(a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
-    """Map points from frame b to frame a."""
+    """Map points from frame b to frame a by the rigid transform `a_from_b`."""
     return points @ a_from_b[..., :3, :3].transpose(-1, -2) + a_from_b[..., None, :3, 3]
 
 
 def rotate(a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
-    """Map directions from frame b to frame a."""
+    """Rotate directions from frame b to frame a; the translation of `a_from_b` is ignored."""
     return directions @ a_from_b[..., :3, :3].transpose(-1, -2)
 
 
 def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the matrix of the cross product: `skew(v) @ w == v x w`."""
+    """Return the skew-symmetric matrix of the cross product with v: `skew(v) @ w == v x w`."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
     rows = [torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))]
@@ -66,19 +66,19 @@ def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return the angle [rad] of a rotation, accurate near 0 and near pi."""
+    """Return the angle [rad] of rotation matrices, accurate near 0 and near pi."""
     axis = (rotation - rotation.mT)[..., [2, 0, 1], [1, 2, 0]]
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     return torch.atan2(torch.linalg.vector_norm(axis, dim=-1), trace - 1)
 
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
-    """Return all subsets of `size` numbers below `count`, in lexical order."""
+    """Return all subsets of `size` numbers out of 0 to `count` - 1, one row per subset, in lexical order."""
     return torch.tensor(list(itertools.combinations(range(count), size)), device=device)
 
 
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
-    """Return which contact sets lie nearly on a line: even their largest triangle is too flat."""
+    """Return a mask of the contact sets that lie nearly on a line: even the largest contact triangle is too flat."""
     # Least height of the largest contact triangle over its longest side: noise turns the frame of a flatter one
     min_ratio = 1e-3
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
@@ -89,7 +89,7 @@ def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
 
 
 def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the virtual frame of three contacts, Eqs. (15)-(17): `a_from_vf` for points given in frame a.
+    """Return the pose `a_from_vf` of the virtual frame of three contacts given in frame a, Eqs. (15)-(17) of the paper.
 
     The origin is the centroid of the contacts (Eq. 16). The x axis points from the first contact to the third. The z
     axis is the normal of their plane.

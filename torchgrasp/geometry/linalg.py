@@ -1,4 +1,4 @@
-"""Linear algebra without silent repair: checked Cholesky factors, Mahalanobis distances, farthest points."""
+"""Linear algebra: Cholesky factors, which are checked but never repaired, Mahalanobis distances, farthest points."""
 
 import math
 from collections.abc import Callable
@@ -20,20 +20,20 @@ def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
 
 
 def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-    """Return unit vectors also where squared lengths would overflow or underflow; otherwise the bits of `unit`."""
+    """Return vectors of length 1 in the direction of `v`, even where squared lengths would overflow or underflow."""
     exponent = torch.frexp(v.abs().amax(-1, keepdim=True)).exponent - 1
     return unit(v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent))  # a power of two rounds nothing
 
 
 def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
-    """Return two unit vectors across each unit vector: (first, second, normal) is a right-handed frame."""
+    """Return two unit vectors perpendicular to each unit normal: (first, second, normal) is a right-handed frame."""
     helper = torch.zeros_like(normal).scatter(-1, normal.abs().argmin(-1, keepdim=True), 1.0)
     first = unit(torch.linalg.cross(normal, helper))
     return first, torch.linalg.cross(normal, first)
 
 
 def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:
-    """Return n unit vectors spread evenly over the sphere, from +z to -z, each rotated by `angle` [rad] about z."""
+    """Return n unit vectors spread over the sphere, from +z to -z; vector k has the azimuth `angle` * (k + `start`)."""
     k = torch.arange(n, dtype=torch.float64)
     z = 1 - (2 * k + 1) / n
     rotation = angle * (k + start)
@@ -47,13 +47,16 @@ def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"
 
 
 def solve_least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]) -> Float[Tensor, "k"]:
-    """Return the shortest x that minimises |rows x - values|, by the pseudo-inverse."""
+    """Return the shortest vector x that minimises |rows @ x - values|, by the pseudo-inverse."""
     # On a CPU the column pivots of torch.linalg.lstsq are undefined: its last digits differ from call to call.
     return torch.linalg.pinv(rows) @ values
 
 
 def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tensor, "*b n n"]:
-    """Return the lower Cholesky factor, without jitter; else raise `IndefiniteCovariance` with `what` and `fix`."""
+    """Return the lower Cholesky factor of a matrix, without added jitter.
+
+    An indefinite matrix raises `IndefiniteCovariance`; its message names the matrix by `what` and suggests the `fix`.
+    """
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not bool((info == 0).all() & torch.isfinite(factor).all()):  # one wait for the device
         finite = bool(torch.isfinite(matrix).all())
@@ -63,7 +66,7 @@ def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tens
 
 
 def squared_mahalanobis(difference: Float[Tensor, "*b d"], factor: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b"]:
-    """Return the squared Mahalanobis distance x^T Sigma^-1 x; `factor` is the lower Cholesky factor of Sigma."""
+    """Return the squared Mahalanobis distance d^T S^-1 d of differences d; `factor` is the Cholesky factor of S."""
     whitened = torch.linalg.solve_triangular(factor, difference[..., None], upper=False)[..., 0]
     return (whitened * whitened).sum(-1)
 
@@ -76,7 +79,7 @@ def farthest_points(
     distance: Callable[[Tensor, Tensor], Tensor] | None = None,
     before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points, each the farthest from those before (farthest-point sampling).
+    """Return the indices of at most `count` points, each the farthest from the points before it.
 
     Args:
         points: vectors, or any values that `distance` compares.
@@ -106,11 +109,11 @@ def farthest_points(
 
 
 def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
-    """Mirror points across planes n.x = o, given as (n, o)."""
+    """Mirror points across planes n.x = o, given as vectors (n, o) with unit normal n and offset o."""
     height = (points * plane[..., :3]).sum(-1, keepdim=True) - plane[..., 3:]
     return points - 2.0 * height * plane[..., :3]
 
 
 def reflect_directions(directions: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
-    """Mirror directions across planes n.x = o, given as (n, o)."""
+    """Mirror directions across planes n.x = o, given as vectors (n, o) with unit normal n and offset o."""
     return directions - 2.0 * (directions * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]

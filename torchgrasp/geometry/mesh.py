@@ -26,11 +26,11 @@ LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
-    """Read a closed mesh [m] from a file, or check a given one; a bad mesh is never repaired.
+    """Return a closed triangle mesh [m], read from a file or given, after checks; a bad mesh is never repaired.
 
     Raises:
-        MeshError: no mesh in the file, a format other than `SUFFIXES`, or more than `MESH_BYTES` or `MESH_FACES`;
-            non-finite vertices, an open surface, faces that are not all turned outward, or no volume.
+        MeshError: the file is no .obj, .off, .ply or .stl file, has no faces, or has too many faces or bytes; or the
+            mesh has non-finite vertices, an open surface, faces that are not all turned outward, or no volume.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
     """
     import trimesh
@@ -57,7 +57,7 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 
 
 def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
-    """Raise `MeshError` unless a mesh encloses a volume."""
+    """Raise `MeshError` unless a mesh encloses a volume; the message calls the mesh `name`."""
     if not 0 < len(mesh.faces) <= MESH_FACES:
         allowed = f"a closed mesh of at most {MESH_FACES} triangles"
         raise MeshError("mesh", f"{name} of {len(mesh.faces)} faces", allowed)
@@ -77,9 +77,9 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
 
 
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the point of each triangle (n, 3 corners, 3) closest to its point (n, 3), and where it lies.
+    """Return, for each point (n, 3), the closest point on its triangle (n, 3 corners, 3), and where this lies.
 
-    The second result is 0 for the face, 1 to 3 for the sides ab, bc, ca, and 4 to 6 for the corners a, b, c.
+    The second result is 0 inside the face, 1 to 3 for the sides ab, bc, ca, and 4 to 6 for the corners a, b, c.
     """
     a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     w = points - a
@@ -102,7 +102,7 @@ def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.
 
 
 def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the part of a mesh where a field is negative, and a mask of the vertices made by the cut.
+    """Return vertices and faces of the part of a mesh where a field is negative, and a mask of the vertices on the cut.
 
     `values` (v,) is the field at the `vertices` (v, 3); it is linear within each of the `faces` (f, 3).
     """
@@ -113,7 +113,7 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
     ends: list[tuple[int, int]] = []
 
     def cross(a: int, b: int) -> int:
-        """Return the vertex at which the field vanishes on a side."""
+        """Return the index of the new vertex at which the field is zero between the vertices a and b."""
         key = (min(a, b), max(a, b))
         if key not in made:
             made[key] = len(vertices) + len(ends)
@@ -136,10 +136,10 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Read a mesh from the bytes of a file with `trimesh.load_mesh`; a malformed file may raise any exception.
+    """Return what `trimesh.load_mesh` reads from the bytes of a file; a malformed file may raise any exception.
 
     Raises:
-        ValueError: more than `MESH_FACES`, or a header beyond `PLY_PROPERTIES` or `PLY_HEADER_BYTES`.
+        ValueError: the file has more than `MESH_FACES` faces, or a .ply header too long or with too many properties.
     """
     import trimesh
 
@@ -153,7 +153,7 @@ def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
 
 @contextlib.contextmanager
 def _quiet(log: logging.Logger) -> Iterator[None]:
-    """Suppress the log records of this thread, which Python would print on stderr."""
+    """Suppress the records that this thread sends to `log` in a `with` block; Python would print them on stderr."""
     here = threading.get_ident()
 
     def drop(record: logging.LogRecord) -> bool:
@@ -167,7 +167,7 @@ def _quiet(log: logging.Logger) -> Iterator[None]:
 
 
 def _count_faces(data: bytes, suffix: str) -> int:
-    """Return the number of faces that a file declares; 0 if the format bounds it by the file's size."""
+    """Return the number of faces that a file declares, or 0 for a format in which the file's size bounds the number."""
     if suffix == ".obj":
         return data.count(b"\nf")
     if suffix == ".stl":
@@ -177,7 +177,7 @@ def _count_faces(data: bytes, suffix: str) -> int:
 
 
 def _read_header(data: bytes) -> int:
-    """Return the number of faces in the header of a .ply file, which is read as leniently as trimesh does."""
+    """Return the number of faces in the header of a .ply file; the header is read as leniently as trimesh reads it."""
     properties = faces = 0
     for line in io.BytesIO(data[:PLY_HEADER_BYTES]):
         words = line.split()

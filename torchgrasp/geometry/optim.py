@@ -20,7 +20,7 @@ SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
 
 @dataclasses.dataclass(frozen=True)
 class Linearisation(Batch):
-    """The costs of a batch at its states; subclasses add the linear model."""
+    """The cost of each problem of a batch at its current state; subclasses add the linear model."""
 
     cost: Float[Tensor, "a"]
 
@@ -28,29 +28,29 @@ class Linearisation(Batch):
 Damping = Float[Tensor, "a"]
 Step = Float[Tensor, "a d"]
 Steps = tuple[Step, Bool[Tensor, "a"]]
-"""A step of each row, and whether the row goes on; a row that does not has ended."""
+"""The step of each problem, and whether its minimisation goes on."""
 Verdict = tuple[Bool[Tensor, "a"], Damping]
-"""Which steps are accepted, and the damping of the next ones."""
+"""Whether the step of each problem is accepted, and the damping of its next step."""
 State = TypeVar("State", bound=Batch)
 Model = TypeVar("Model", bound=Linearisation)
 
 
 class Problem(abc.ABC, Generic[State, Model]):
-    """A batch of minimisation problems: costs, steps and rules of acceptance."""
+    """A batch of minimisation problems: their costs, their steps, and the rule by which a step is accepted."""
 
     first_damping: float = 1e-2
 
     @abc.abstractmethod
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> Model:
-        """Return cost and linear model of the problems with indices `rows`, at their states."""
+        """Return the costs and linear models of the problems with the indices `rows`, at their states."""
 
     @abc.abstractmethod
     def step(self, model: Model, damping: Damping) -> Steps:
-        """Return the solution of the damped normal equations, and which problems go on."""
+        """Return the steps that solve the damped normal equations, and which problems go on."""
 
     @abc.abstractmethod
     def move(self, state: State, x: Step) -> State:
-        """Return the states after a step."""
+        """Return the states of the problems after the steps `x`."""
 
     @abc.abstractmethod
     def judge(self, model: Model, trial: Model, x: Step, damping: Damping) -> Verdict:
@@ -65,7 +65,7 @@ class Problem(abc.ABC, Generic[State, Model]):
 def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int) -> tuple[State, Float[Tensor, "b"]]:
     """Minimise every problem of a batch by damped Gauss-Newton steps; return final states and costs.
 
-    Each step costs one evaluation. No gradient flows through the minimisation.
+    Every problem takes at most `steps` steps, each with one evaluation. No gradient flows through the minimisation.
     """
     whole, rows = state, torch.arange(len(state))
     model = problem.linearise(state, rows)
@@ -92,7 +92,7 @@ Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
 
 @dataclasses.dataclass(frozen=True)
 class LinearResiduals(Linearisation):
-    """Residuals and their Jacobian at the states of a batch."""
+    """The residuals of each problem of a batch at its state, and their Jacobian."""
 
     residual: Float[Tensor, "a m"]
     jacobian: Float[Tensor, "a m d"]
@@ -103,9 +103,9 @@ class LeastSquares(Problem[State, LinearResiduals]):
     """A batch of least-squares problems: the cost is the sum of squared residuals.
 
     Args:
-        residuals: returns residuals and Jacobian of the problems with given indices, at their states.
-        moved: returns the states after a step.
-        solved: sum of squares at which a problem is solved.
+        residuals: function that returns residuals and Jacobian of the problems with given indices, at their states.
+        moved: function that returns the states after given steps.
+        solved: sum of squared residuals below which a problem is solved.
         largest: largest change of a variable in one step.
     """
 
@@ -115,12 +115,15 @@ class LeastSquares(Problem[State, LinearResiduals]):
     largest: float = 0.3
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
-        """Evaluate residuals, Jacobian and the sum of squares."""
+        """Return the residuals, their Jacobian and the sum of squared residuals of each problem."""
         residual, jacobian = self.residuals(state, rows)
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Damping) -> Steps:
-        """Return the damped step, no variable changed by more than `largest`; zero where the matrix is singular."""
+        """Return the damped step of each problem, and whether the problem goes on.
+
+        A step changes no variable by more than `largest`. It is zero if the matrix of the problem is singular.
+        """
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.
@@ -131,7 +134,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
         return x, ~(model.cost < self.solved) & torch.isfinite(damping)
 
     def move(self, state: State, x: Step) -> State:
-        """Return the states after a step."""
+        """Return the states of the problems after the steps `x`."""
         return self.moved(state, x)
 
     def judge(self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping) -> Verdict:

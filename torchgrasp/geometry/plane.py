@@ -24,7 +24,7 @@ POINTS, DIRECTIONS, POSES = (
     ("normals", "approach", "witness", "frustum"),
     ("obj_from_hand", "obj_from_vf"),
 )
-"""Fields of values that change with the frame; all other fields are invariant."""
+"""Names of the fields that change with the coordinate frame, by kind; all other fields are invariant."""
 
 
 LEAST_TILT = 0.05  # least sine of the angle between the vertical and a camera that has an azimuth
@@ -92,10 +92,10 @@ def upright_frame(
 ) -> Float[Tensor, "4 4"]:
     """Return `obj_from_upright`: the pose of a frame that is fixed to points, camera and table.
 
-    The z axis is the table's normal. If there is no table, it points to the camera; if there is no camera either, it is
-    the least principal axis of the points. The x axis is horizontal and points towards the camera. If the camera is
-    straight above, x points to the point farthest from the vertical through the points' centroid. The origin is on this
-    vertical, on the table if there is one.
+    The z axis is the table's normal. Without a table, z points to the camera; without both, z is the direction in which
+    the points spread least. The x axis is horizontal and points towards the camera. If the camera is straight above, x
+    points to the point farthest from the vertical through the points' centroid. The origin is on this vertical, on the
+    table if there is one.
 
     Raises:
         BadArgument: most points are below the table.
@@ -126,22 +126,22 @@ def upright_frame(
 
 
 def to_upright(points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4 4"]) -> Float[Tensor, "*b 3"]:
-    """Return points [m] in the upright frame, rounded to `GRID`."""
+    """Return points [m] in the upright frame, rounded to multiples of the fine step `GRID` [m]."""
     return _round(apply(inverse(obj_from_upright).to(points.device), points.double().reshape(-1, 3))).reshape_as(points)
 
 
 def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value, such as a cloud, in the upright frame, in float64 and with every number rounded to `GRID`."""
+    """Return a value, such as a cloud, in the upright frame, in float64, each number rounded to multiples of `GRID`."""
     return map_tensors(_round, move(value.to(torch.float64), inverse(obj_from_upright)))
 
 
 def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round to multiples of `GRID` plus a phase: float32 numbers often lie halfway between two multiples."""
+    """Round to multiples of `GRID` plus a constant, because float32 numbers often lie halfway between two multiples."""
     return torch.round(x / GRID + 1 / math.pi) * GRID
 
 
 def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value of `torchgrasp.values`, transformed from frame a to frame b [m]."""
+    """Return a value, such as a cloud or grasps, transformed from frame a to frame b, with lengths in metres."""
 
     def moved(name: str, x: Any) -> Any:
         if isinstance(x, Value):

@@ -1,4 +1,4 @@
-"""Planes through many points of a view, one after the other: proposed by triples, refined by robust least squares."""
+"""Planes that hold many points of a view: triples of points propose planes, robust least squares refines them."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ def assume_noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -
 
 
 class View:
-    """Points [m] about their centre, the camera, the direction against gravity, and the noise."""
+    """One view: points [m] about their centre, their noise [m], camera position `eye`, and direction `sky` of up."""
 
     def __init__(
         self, points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None, sky: Float[Tensor, "3"] | None
@@ -34,7 +34,7 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class PlaneFit:
-    """A plane normal . p = offset, the scale of the noise about it, and the number of points on it."""
+    """A plane normal . p = offset [m] that holds `count` points; `scale` is their measured over their assumed noise."""
 
     normal: Float[Tensor, "3"]
     offset: float
@@ -53,7 +53,7 @@ class PlaneFit:
 
 
 def fit_planes(view: View, generator: torch.Generator) -> Iterator[PlaneFit]:
-    """Yield planes through many points, one after the other."""
+    """Yield at most 8 planes, each with the most points that lie on no plane before it."""
     scored = 2000  # points that score the proposals
     points, noise = view.points[:scored], view.noise[:scored]
     normals, offsets = _propose(view, scored, generator)
@@ -70,7 +70,7 @@ def fit_planes(view: View, generator: torch.Generator) -> Iterator[PlaneFit]:
 
 
 def _propose(view: View, scored: int, generator: torch.Generator) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Return unit normals and offsets of planes through triples of points, far apart and close together."""
+    """Return unit normals and offsets [m] of planes through random triples of points, distant or neighbouring."""
     from scipy.spatial import KDTree
 
     points = view.points
@@ -94,7 +94,7 @@ def _propose(view: View, scored: int, generator: torch.Generator) -> tuple[Float
 def _held(
     points: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normals: Float[Tensor, "m 3"], offsets: Float[Tensor, "m"]
 ) -> Float[Tensor, "m n"]:
-    """Return 1 where a point is within twice the noise of a plane, else 0."""
+    """Return a matrix of planes by points: 1 if the point is within twice its noise of the plane, else 0."""
     held = torch.empty(len(normals), len(points))
     for rows in torch.arange(len(normals)).split(500):
         held[rows] = ((normals[rows] @ points.T - offsets[rows, None]).abs_() < 2 * noise).float()
@@ -102,7 +102,7 @@ def _held(
 
 
 def _refine(view: View, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
-    """Return the plane of weighted least squares with Tukey's weights, which change smoothly with the points."""
+    """Refine a plane by iterated least squares with Tukey's weights, which change smoothly with the points."""
     points, noise, scale = view.points, view.noise, 1.0
     for _ in range(30):
         ratio = (points @ normal - offset) / noise

@@ -42,7 +42,7 @@ class SignedDistanceField(Value):
 
     @checked(gradients=True)
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] at the grid node nearest to each point; outside the grid it is too small."""
+        """Return the signed distance [m] at the grid node nearest to each point; outside the grid, at its border."""
         flat = 0
         for x, low, count in zip(points.unbind(-1), self.origin.to(points), self.values.shape, strict=True):
             node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
@@ -51,9 +51,9 @@ class SignedDistanceField(Value):
 
     @checked(gradients=True)
     def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return the interpolated signed distance [m] and its gradient.
+        """Return the interpolated signed distance [m] at each point, and its gradient.
 
-        Outside the grid the distance to the grid is added.
+        Outside the grid, the distance [m] from the grid is added to the value at the border.
         """
         _, ny, nz = self.values.shape
         position = (points - self.origin.to(points)) / self.spacing
@@ -112,14 +112,14 @@ def field_from_surface(
 
 
 def _keep(known: np.ndarray) -> np.ndarray:
-    """Return which nodes of a grid twice as fine are already known: every second along each axis."""
+    """Return the mask of known nodes on a grid twice as fine, from the mask `known` on the coarse grid."""
     fine = np.zeros([2 * count - 1 for count in known.shape], dtype=bool)
     fine[::2, ::2, ::2] = known
     return fine
 
 
 def _refine(values: np.ndarray) -> np.ndarray:
-    """Return the values interpolated to a grid twice as fine: cubic in the distance, sign of the previous node."""
+    """Return signed distances on a grid twice as fine; new nodes have cubic distances and the previous node's sign."""
     # Far from an open mesh the sign jumps, where a cubic of signed distances would be wrong.
     sign, distance = values < 0, np.abs(values)
     for axis in range(3):
@@ -128,7 +128,7 @@ def _refine(values: np.ndarray) -> np.ndarray:
 
 
 def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
-    """Return the values with a new one between every two along an axis: cubic, or for signs the previous value."""
+    """Return values with a new one between any two neighbours on an axis: cubic, or for signs the previous value."""
     known = np.moveaxis(values, axis, 0)
     fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=known.dtype)
     fine[::2] = known
@@ -166,7 +166,7 @@ class _Surface:
         self.tree, self.few = KDTree(samples, leafsize=32), KDTree(samples[::FAR_SHARE], leafsize=32)
 
     def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3); `far` uses fewer samples."""
+        """Return the signed distances [m] of points (n, 3); `far` uses fewer samples, for distant points."""
         parts, tree, owners = [], self.few if far else self.tree, self.owner[::FAR_SHARE] if far else self.owner
         for part in (points[k : k + 8192] for k in range(0, max(1, len(points)), 8192)):
             _, index = tree.query(part, k=1 if far else min(3, len(owners)))
@@ -181,7 +181,7 @@ class _Surface:
 
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
-    """Return the pseudonormals (f, 7, 3) of each triangle's face, sides and corners (Baerentzen and Aanaes, 2005)."""
+    """Return the pseudonormals (Baerentzen and Aanaes, 2005) of face, 3 sides, 3 corners of triangles, (f, 7, 3)."""
     from trimesh.grouping import unique_rows
 
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -198,5 +198,5 @@ def _pseudonormals(corners: np.ndarray) -> np.ndarray:
 
 
 def _sum_by(number: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return the sums of those vectors (n, 3) that have the same number."""
+    """Return one row per number: the sum of the vectors (n, 3) that have this number."""
     return np.stack([np.bincount(number, weights=column) for column in vectors.T], 1)

@@ -1,4 +1,4 @@
-"""The supports in a view: planes that objects stand on, each with its region, found in points of any frame."""
+"""Search for supports in a view: planes that objects stand on, each with the region that it covers, in any frame."""
 
 import dataclasses
 import math
@@ -39,7 +39,7 @@ class Support:
     width: float = math.inf
 
     def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
-        """Return which points are over the region or at most `margin` [m] beside it; a negative margin shrinks it."""
+        """Return which points lie over the region or at most `margin` [m] beside it; a negative margin shrinks it."""
         if self.sides is None:
             return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
         sides, rows = self.sides.to(points), points.reshape(-1, 3).split(10_000)  # parts that a cache holds
@@ -58,7 +58,10 @@ class Support:
 def find_table(
     points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], table: Plane | float | None, up: object
 ) -> tuple[Support, ...]:
-    """Return the support on the given plane, or the supports that are found, with the camera above them."""
+    """Return the support on a given table, or without a table all supports found in the points, best first.
+
+    The camera at `viewpoint` [m] must be above them. `up` is a vector against gravity, or None if it is unknown.
+    """
     plane = as_plane(table)
     direction = None if up is None else torch.as_tensor(up).double().cpu()
     if plane is None:
@@ -80,7 +83,7 @@ def fit_support(
     *,
     seed: int = 0,
 ) -> Plane:
-    """Return the plane of the most plausible support; see `find_supports`."""
+    """Return the plane that most plausibly supports objects. Arguments and errors are those of `find_supports`."""
     return find_supports(points, viewpoint, up, seed=seed)[0].plane
 
 
@@ -92,12 +95,12 @@ def find_supports(
     seed: int = 0,
     least_width: float = LEAST_WIDTH,
 ) -> tuple[Support, ...]:
-    """Return the supports in a view, the most plausible first, whatever the frame.
+    """Return the planes that support objects in a view, the most plausible first, each with the region that it covers.
 
-    Triples of points propose planes. An iterated fit with Tukey's weights refines each. Objects stand on a support,
-    over its region, and the camera sees nothing through the region. The support with the most points low above it comes
-    first; they count twice if the camera looks at it. Of parallel supports, a higher one as wide as furniture comes
-    first. A rigid motion of all arguments moves the supports alike.
+    Triples of points propose planes. An iterated fit with Tukey's weights refines each plane. Objects stand on a
+    support, over its region, and the camera sees nothing through the region. The support with the most points low above
+    it comes first; the points count twice if the camera looks at the support. Of parallel supports, a higher one as
+    wide as furniture comes first. A rigid motion of all arguments moves the supports alike.
 
     Args:
         points: everything that was seen [m].
@@ -158,7 +161,7 @@ def bound(
 
 
 def _axes(normal: Float[Tensor, "3"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 2"]:
-    """Return two unit vectors across a normal, which turn with the points."""
+    """Return two unit vectors (columns) perpendicular to a normal; they rotate with the points."""
     side = points[0] - points.mean(0)
     x = unit(side - (side @ normal) * normal)
     return torch.stack([x, torch.linalg.cross(normal, x)], -1)
@@ -166,7 +169,7 @@ def _axes(normal: Float[Tensor, "3"], points: Float[Tensor, "n 3"]) -> Float[Ten
 
 @dataclasses.dataclass(frozen=True)
 class Hull:
-    """A convex polygon: its corners [m], and outward unit normal and offset of each side."""
+    """A convex polygon in a plane: its corners [m], and the outward unit normal and offset [m] of each side."""
 
     corners: Float[Tensor, "k 2"]
     sides: Float[Tensor, "s 3"]
@@ -183,7 +186,7 @@ class Hull:
         return cls(points[torch.from_numpy(hull.vertices).long()], torch.from_numpy(hull.equations))
 
     def holds(self, points: Float[Tensor, "n 2"], margin: float = 0.0) -> Bool[Tensor, "n"]:
-        """Return which points are inside, or at most `margin` [m] beside it; a negative margin shrinks the polygon."""
+        """Return which points are in the polygon or at most `margin` [m] outside; a negative margin shrinks it."""
         return (points @ self.sides[:, :2].T + self.sides[:, 2] < margin).all(-1)
 
     @property
@@ -193,9 +196,10 @@ class Hull:
 
 
 def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
-    """Yield the connected parts of points in a plane by falling size, down to a fiftieth of the largest.
+    """Yield the connected groups of points in a plane, the largest first, down to a fiftieth of the largest.
 
-    Square cells of 3 cm are closed over gaps and opened, which drops strips where other surfaces cross the plane.
+    Points in adjacent square cells of 3 cm are connected. Small gaps between cells are closed. Narrow strips of cells
+    are dropped: there, other surfaces cross the plane.
     """
     from scipy.ndimage import binary_closing, binary_opening, label
 
@@ -215,9 +219,9 @@ def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
 def cross(
     plane: Plane, points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Return where the rays through points cross a plane, and which points lie behind it.
+    """Return where the camera rays through points cross a plane [m], and which points lie behind the plane.
 
-    Without a camera, the rays are vertical, and points more than `REACH` below the plane do not count.
+    Without a camera, the points themselves are returned, and points more than `REACH` [m] below the plane do not count.
     """
     height = plane.height(points)
     if eye is None:
@@ -240,7 +244,7 @@ class _Candidate:
         return float(self.support.plane.normal @ other.support.plane.normal) > 0.985
 
     def repeats(self, other: "_Candidate") -> bool:
-        """Return whether a candidate is another fit of the same plane."""
+        """Return whether the other candidate is a fit of the same plane."""
         return self.parallel(other) and abs(float(other.support.plane.height(self.middle))) < 0.02
 
 
@@ -254,7 +258,7 @@ def _ordered(found: list[_Candidate]) -> list[_Candidate]:
 
 
 def _judge(view: View, fit: PlaneFit, least_width: float) -> _Candidate | str:
-    """Return a plane as a candidate, or the reason why it is not a support."""
+    """Return the candidate support on a fitted plane, or as text the reason why the plane supports nothing."""
     points, height = view.points, view.points @ fit.normal - fit.offset
     tolerance = 4 * fit.scale * view.noise + 0.001
     share = fit.count / len(points)
