@@ -19,7 +19,10 @@ SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
 def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
-    """Map the tensors in the same field of several values, nested too; other fields are those of the first value."""
+    """Apply a function to the tensors that several values have in the same field; return a value of the results.
+
+    Values in fields are mapped, too. Fields without tensors are copied from the first value.
+    """
 
     def merge(name: str, *found: Any) -> Any:
         if isinstance(found[0], Value):
@@ -40,7 +43,7 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
 
 
 class Value:
-    """Base of all values: a frozen dataclass of tensors, which `.to()` moves to a device or dtype as a new value."""
+    """Base class of all values: frozen dataclasses of tensors. `.to()` returns a copy on another device or dtype."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -89,18 +92,18 @@ def _digits(value: Any) -> str:
 
 
 class Batch(Value):
-    """A value whose tensors share a leading batch axis: indexing selects rows, `len` gives their number."""
+    """A value whose tensors share their first axis, the rows. An index selects rows; `len` is their number."""
 
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(getattr(self, dataclasses.fields(self)[0].name))  # pyright: ignore[reportArgumentType]
 
     def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:
-        """Return the rows at a slice, a mask or indices. A single index also keeps the batch axis.
+        """Return a batch of the rows that a slice, a mask or indices select. A single index gives a batch of one row.
 
         Raises:
-            BadArgument: a single boolean, or no index at all.
-            IndexError: a single index beyond the rows.
+            BadArgument: the index is of another kind, such as a single boolean.
+            IndexError: a single index is out of range.
         """
         chosen = read_rows(rows, len(self))  # once for all tensors: on a GPU the host waits for the number of rows
         return map_tensors(lambda x: x[chosen], self)
@@ -110,7 +113,7 @@ class Batch(Value):
         return (self[i] for i in range(len(self)))
 
     def raise_for_status(self: SomeBatch) -> SomeBatch:
-        """Return the value itself when every row is `Status.OK`; raise `FailedRows` with counts otherwise."""
+        """Return this batch if the status of every row is `Status.OK`; else raise `FailedRows` with the counts."""
         counts = count_status(getattr(self, "status"))  # noqa: B009
         failed = {s: k for s, k in counts.items() if s is not Status.OK}
         if failed:
@@ -119,7 +122,7 @@ class Batch(Value):
 
 
 def read_rows(rows: Any, count: int) -> slice | Tensor:
-    """Return an index of any kind into `count` rows as a slice or a tensor; raises as `Batch.__getitem__`."""
+    """Convert any index of a batch of `count` rows to a slice or a tensor; raise the errors of `Batch.__getitem__`."""
     refused = BadArgument("rows", show(rows), "an index, a slice, a mask of all rows or a tensor of indices")
     if isinstance(rows, slice):
         return rows
@@ -144,29 +147,29 @@ def read_rows(rows: Any, count: int) -> slice | Tensor:
 
 
 def join(parts: Sequence[SomeBatch]) -> SomeBatch:
-    """Concatenate the rows of batches; fields without tensors are those of the first batch."""
+    """Concatenate the rows of batches; fields without tensors are copied from the first batch."""
     return map_tensors(lambda *tensors: torch.cat(tensors), *parts)
 
 
 def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch:
-    """Return the new rows where `choose` is True, and the old rows elsewhere."""
+    """Return a batch with the row of `new` where `choose` is True, and the row of `old` where it is False."""
     return map_tensors(lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
 
 def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
-    """Return a batch with the rows `at` replaced by those of `part`."""
+    """Return the batch `whole` after its rows at the indices `at` are replaced by the rows of `part`."""
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
 def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
-    """Evaluate a function of the leading axis in chunks of `size` rows, which bounds the memory."""
+    """Evaluate a function on chunks of `size` rows of x, which bounds the memory; return the joined outputs."""
     if len(x) <= size:
         return evaluate(x)
     return tuple(map(torch.cat, zip(*map(evaluate, x.split(size)), strict=True)))
 
 
 def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
-    """Return all tensors in a value by their dotted field names."""
+    """Return all tensors of a value and of the values in its fields by dotted name, such as `contacts.points`."""
     tensors: dict[str, Tensor] = {}
     for field in dataclasses.fields(value):  # pyright: ignore[reportArgumentType]
         inner = getattr(value, field.name)
@@ -178,18 +181,18 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
 
 
 def settle(value: SomeValue, device: torch.device) -> SomeValue:
-    """Return a value on a device; if it is already there the value itself, with its caches."""
+    """Return a value moved to a device; a value that is already there is returned itself, with its caches."""
     return value if all(x.device == device for x in named_tensors(value).values()) else value.to(device)
 
 
 def check_device(name: str, found: torch.device, beside: str, wanted: torch.device) -> None:
-    """Raise `BadArgument` unless an argument is on the same device as the one `beside` it."""
+    """Raise `BadArgument` unless the device `found` of argument `name` is the one `wanted` by argument `beside`."""
     if found != wanted:
         raise BadArgument(name, f"tensors on {found}", f"tensors on {wanted}, as {beside}: `.to` moves them")
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Return how many rows have each status, the most frequent first."""
+    """Return the number of rows with each status, as a dict that begins with the most frequent status."""
     codes, counts = torch.unique(status, return_counts=True)
     pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))
     return {Status(code): count for code, count in pairs}

@@ -40,7 +40,7 @@ _thread = threading.local()  # `inside` is True while this thread is in a checke
 
 @dataclasses.dataclass
 class _Call:
-    """The state of checking one call: options, and the sizes of shape letters found so far."""
+    """The state while the arguments of one call are checked: options, axis sizes found so far, tensors to test."""
 
     gradients: bool
     deep: bool = True
@@ -50,7 +50,7 @@ class _Call:
     rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
 
     def check_numbers(self) -> None:
-        """Raise `BadArgument` for NaN, infinity, and transforms that are not rigid."""
+        """Raise `BadArgument` if a tensor to test has NaN or infinity, or a transform to test is not rigid."""
         for tensors, test, allowed in (
             (self.finite, torch.isfinite, "finite numbers"),
             (self.rigid, is_rigid, RIGID),
@@ -69,12 +69,12 @@ def checked(*, gradients: bool) -> Callable[[Checked], Checked]: ...
 def checked(thing: Any = None, *, gradients: bool = False) -> Any:
     """Check the arguments of a function, or the fields of a dataclass when it is made, against their annotations.
 
-    NumPy numbers become Python numbers. The fields of an argument that is a value are checked again. In a method,
-    letters in shapes have the sizes of the value's fields. A value without `__post_init__` that the library itself
-    makes from tensors is not checked. Only with `gradients` may tensors require a gradient.
+    NumPy numbers become Python numbers. If an argument is a value, its fields are checked again. In a method, a letter
+    in a shape has the same size as in the fields of the object. A value without `__post_init__` that the library makes
+    from tensors is not checked. Tensors that require a gradient are refused unless `gradients` is True.
 
     Raises:
-        BadArgument: when called: an argument of another type, shape, dtype or range, or a number that is not finite.
+        BadArgument: in a call, an argument has a wrong type, shape, dtype or range, or a number that is not finite.
     """
     if thing is None:
         return functools.partial(checked, gradients=gradients)
@@ -86,7 +86,7 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
 
 
 def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool]) -> Any:
-    """Return a function that checks its arguments before the call; `always`: also in calls by the library itself."""
+    """Return `function` with a check of its arguments; `always()` tells whether to check calls by the library, too."""
     signature = inspect.signature(function)
     is_method = next(iter(signature.parameters), "") == "self" and not isinstance(owner, type)
     several = {p.name: p.kind for p in signature.parameters.values() if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
@@ -118,7 +118,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
 
 
 def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
-    """Return an argument that satisfies its annotation, numbers as Python numbers; raise `BadArgument` otherwise."""
+    """Return an argument if it satisfies its annotation, a number as a Python number; else raise `BadArgument`."""
     origin, inside = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         return _read_marked(name, value, inside[0], inside[1], call)
@@ -144,7 +144,7 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
 
 
 def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
-    """Return a number in a range, or a boolean, as a Python number; raise `BadArgument` otherwise."""
+    """Return a value as int, float or bool; raise `BadArgument` if it is of another kind or outside the range."""
     number: Any = value
     if kind is bool:
         good = isinstance(value, bool | np.bool_)
@@ -158,7 +158,7 @@ def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
 
 
 def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> Any:
-    """Return an argument whose annotation has a mark, such as a range or `RIGID`."""
+    """Return an argument if it satisfies the rule in its annotation, a range or `RIGID`; else raise `BadArgument`."""
     if isinstance(mark, Range):
         return read_number(name, value, hint, mark)
     if mark == ANY and hint is float and isinstance(value, float):
@@ -174,7 +174,7 @@ def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> An
 
 
 def _read_union(name: str, value: Any, hint: Any, options: tuple[Any, ...], call: _Call) -> Any:
-    """Return an argument that satisfies any option of a union; otherwise raise the error of the closest option."""
+    """Return an argument if it satisfies one type of a union; otherwise raise the error of the closest type."""
     errors: list[BadArgument] = []
     for option in (x for x in options if x is not int or float not in options):
         try:
@@ -193,7 +193,7 @@ def _read_union(name: str, value: Any, hint: Any, options: tuple[Any, ...], call
 
 
 def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
-    """Return a tensor of the annotated shape and dtype; record the sizes of the shape's letters."""
+    """Return a tensor if it has the annotated shape and dtype; record the sizes of the axes that are letters."""
     axes, sizes, kind = hint.dim_str.split(), dict(call.sizes), hint.dtype.__name__
     if not isinstance(value, Tensor):
         raise BadArgument(name, show(value), f"a torch {describe(hint)[2:]}")
@@ -212,7 +212,7 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
 
 
 def _read_container(name: str, value: Any, origin: type, inside: tuple[Any, ...], call: _Call) -> Any:
-    """Return a tuple, sequence or mapping whose items were checked; items of a stream are checked as they come."""
+    """Return a tuple, sequence or mapping after a check of its items; items of an iterator are checked when drawn."""
     fixed = origin is tuple and inside[-1:] != (...,)
     wrong = not isinstance(value, origin) or isinstance(value, str | bytes | Tensor | np.ndarray)
     if wrong or (fixed and len(value) != len(inside)):
@@ -248,7 +248,7 @@ def _fields(kind: type) -> dict[str, Any]:
 
 
 def _lengths(value: Any) -> dict[str, int]:
-    """Return the sizes of the shape letters in the annotations of a value's tensors."""
+    """Return the size of each letter in the annotated shapes of a value's tensors, such as {"n": 100}."""
     tensors = {field: hint.dim_str.split() for field, hint in _fields(type(value)).items() if is_tensor(hint)}
     simple = {field: axes for field, axes in tensors.items() if not any(axis[0] in "*.#" for axis in axes)}
     pairs = (pair for field, axes in simple.items() for pair in zip(axes, getattr(value, field).shape, strict=False))
@@ -257,7 +257,7 @@ def _lengths(value: Any) -> dict[str, int]:
 
 @functools.cache
 def _hints(thing: Any) -> dict[str, Any]:
-    """Return the annotations of a function or class; names that are only imported for type checkers are resolved."""
+    """Return the annotations of a function or class; names imported only for type checkers are resolved, too."""
     late: dict[str, Any] = {}
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Values of the closing of a hand: options and controller gains before, measured results after."""
+"""Values for the closing of a hand on an object: options, sensors and controller gains, and the measured results."""
 
 import dataclasses
 from typing import Annotated, Literal, NamedTuple
@@ -14,8 +14,10 @@ from torchgrasp.errors import BadArgument, Status
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingGains(Value):
-    """Targets and gains of the closing controller for each finger, in the hand's frame (Eqs. 26-28).
+    """Targets and gains of the closing controller for each finger, in the hand's frame (Eqs. 26-28 of the paper).
 
+    `target` [m] is the planned position of a contact, `covariance` [m^2] its uncertainty. `position_gain` [1/s] and
+    `force_gain` [m/(s N)] are diagonals of gain matrices. `desired_force` [N] acts when the hand holds the object.
     `force_source` is "analytic", or "stability" if the stability model chose among the balanced forces.
 
     >>> from torchgrasp import closing_gains, load_hand
@@ -54,11 +56,11 @@ class Disturbance(Value):
     object.
 
     Args:
-        first_touch: time [s] of the first contact; infinite without one.
+        first_touch: time [s] of the first contact; infinite if there is none.
         impulse: sum of the normal impulses [N s].
         force: largest mean normal force [N] in a control tick.
-        early: whether the first contact was before a fingertip touched the object.
-        neighbour_pose: motion of each of m neighbours from its start.
+        early: whether the first of these contacts was before a fingertip touched the object.
+        neighbour_pose: transform that has moved each of m neighbours from its start to its place at each tick.
     """
 
     first_touch: Annotated[Float[Tensor, "3"], ANY]
@@ -78,9 +80,9 @@ class ClosingTrace(Value):
         points: contact points [m]; NaN without contact.
         normals: outward unit normals; NaN without contact.
         sliding: speed [m/s] of each fingertip along the surface.
-        blend: lambda of Eq. (26); NaN if the control law was not active.
-        friction: friction estimated by the holding "grip"; NaN before.
-        load: load [N] estimated by the holding "grip"; NaN before.
+        blend: weight lambda of Eq. (26), 0 for position and 1 for force control; NaN if the control law was not active.
+        friction: coefficient of friction that the holding mode "grip" estimates; NaN before the hand holds.
+        load: load [N] on the grasp that the holding mode "grip" estimates; NaN before the hand holds.
     """
 
     forces: Annotated[Float[Tensor, "t f 3"], ANY]
@@ -104,16 +106,16 @@ class ClosureResult(Value):
         forces: normal force [N] of each fingertip.
         object_pose: pose of the object in the frame of the grasp.
         hand_pose: pose of the hand in the frame of the grasp.
-        joints: every joint of the URDF, in the order of `joint_names`.
+        joints: positions [rad] of every joint of the URDF, in the order of `joint_names`.
         joint_names: names of the joints.
         contact_order: the fingers in the order of their first contacts.
         object_motion: motion of the object in the hand from the pre-grasp to the end.
         pushed: motion of the object from the pre-grasp until all fingers touched, or the closing ended.
         before_lift: motion of the object from the start to the lift.
         unbalanced: norm of the sum of the fingertip forces before the lift, relative to the sum of their norms.
-        slip: motion of the object in the hand after the pressing.
-        start_overlap: penetration depth [m] of the opened hand into object or table at the start.
-        disturbance: unplanned contacts.
+        slip: motion of the object in the hand after the hand has pressed.
+        start_overlap: depth [m] by which the opened hand penetrates the object or the table at the start.
+        disturbance: unintended contacts of the hand.
         trace: contacts and estimates at every tick.
         phases: times [s] at which the hand arrived, all fingers touched, and the hand pressed; NaN if never.
         stops: how often the approaching hand stopped at a contact.
@@ -145,17 +147,17 @@ class ClosureResult(Value):
 
 
 SensorKind = Literal["tactile", "torque", "binary"]
-"""Kinds of fingertip sensors, see `SensorModel`."""
+"""Kinds of fingertip sensors; `SensorModel` explains them."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingOptions(Value):
-    """Components of the closing modes "uncertainty" and "fixed", which extend the paper's control law.
+    """Options of the closing modes "uncertainty" and "fixed", which extend the paper's control law.
 
     Args:
-        wait: a finger that touches waits for the others; then all press together.
-        pose_estimate: early and late touches update the object-pose estimate, which moves all contacts.
+        wait: whether a finger that touches waits for the others, so that all press together.
+        pose_estimate: whether early and late touches update the estimated object pose, which moves all contact targets.
         palm_reach: largest displacement [m] of the palm, which follows the estimated object pose; 0 means that the palm
             does not move.
         stops: how often the approaching hand may stop at an unexpected contact and move sideways; 0 means never.
@@ -163,8 +165,8 @@ class ClosingOptions(Value):
             lift.
 
     Raises:
-        BadArgument: a number outside its range; a palm that moves or a second attempt without `pose_estimate`; stops
-            of a palm that does not move.
+        BadArgument: a number outside its range; `palm_reach` or a second attempt without `pose_estimate`; `stops`
+            with a `palm_reach` of 0.
 
     >>> ClosingOptions(palm_reach=0.0, stops=0).attempts  # an arm that cannot yield
     2
@@ -177,7 +179,7 @@ class ClosingOptions(Value):
     attempts: Annotated[int, Range(1, 100)] = 2
 
     def __post_init__(self) -> None:
-        """Check that components that need each other are on."""
+        """Raise `BadArgument` for an option without another option that it needs."""
         if not self.pose_estimate and (self.palm_reach or self.attempts > 1):
             found = f"a reach of {self.palm_reach:g} m and {self.attempts} attempts without pose_estimate"
             raise BadArgument("palm_reach", found, "0 m and 1 attempt")
@@ -186,11 +188,11 @@ class ClosingOptions(Value):
 
 
 NO_OPTIONS = ClosingOptions(wait=False, pose_estimate=False, palm_reach=0.0, stops=0, attempts=1)
-"""No component: the paper's own control law."""
+"""All options off: the paper's own control law."""
 
 
 def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptions:
-    """Return the components of a closing mode, by default all; raise `BadArgument` for a mode that has none."""
+    """Return the options of a closing mode, by default all on; raise `BadArgument` for a mode that takes no options."""
     if closing in ("uncertainty", "fixed"):
         return ClosingOptions() if options is None else options
     if options is not None:
@@ -204,10 +206,10 @@ class SensorModel(Value):
     """The sensors of a hand's fingertips: kind, delay, noise and dead sensors. `FingertipSensor` simulates them.
 
     Args:
-        kind: what they measure. "tactile": force, position and sliding of each contact, like a BioTac. "torque": only
-            the force, from the torques of the finger's joints. "binary": only whether the fingertip touches.
-        delay: age [s] of the readings, in whole samples of the sensor.
-        noise: factor on the usual noise.
+        kind: what the sensors measure. "tactile": force, position and sliding of each contact, like a BioTac.
+            "torque": only the force, from the torques of the finger's joints. "binary": only whether the tip touches.
+        delay: age [s] of the readings, rounded to whole samples of the sensor.
+        noise: factor that multiplies the usual noise of the sensor.
         dead: names of the fingers whose sensor is known to be broken.
 
     Raises:

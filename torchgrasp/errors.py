@@ -1,4 +1,4 @@
-"""The errors of torchgrasp, and the status of a batch row.
+"""The errors of torchgrasp, and the status of each row of a batch.
 
 A bad argument raises a subclass of `GraspError` at the public function, before any work. A failed row of a batch does
 not raise: it has a `Status`, which explains the failure in a sentence.
@@ -50,7 +50,7 @@ class NoSupport(BadArgument):
 
 
 class CloudFileError(BadArgument):
-    """A point-cloud file is missing, empty, or of another format than its suffix."""
+    """A point-cloud file is missing or empty, or its content is not of the format that its suffix names."""
 
 
 class MeshError(BadArgument):
@@ -58,15 +58,15 @@ class MeshError(BadArgument):
 
 
 class HandFileError(BadArgument):
-    """A hand's URDF or hand.toml is missing, malformed, or reaches outside its folder."""
+    """A hand's URDF or hand.toml is missing or malformed, or refers to files outside its folder."""
 
 
 class ModelFileError(BadArgument):
-    """A safetensors file is missing or truncated, or holds other tensors than its kind requires."""
+    """A safetensors file is missing or truncated, or does not hold the tensors expected of its kind."""
 
 
 class DatasetError(BadArgument):
-    """A folder of objects has a bad manifest, or one that names files outside the folder."""
+    """The manifest of a folder of objects is malformed, or names files outside the folder."""
 
 
 class OutputError(BadArgument):
@@ -90,11 +90,11 @@ class IndefiniteCovariance(GraspError, ValueError):
 
 
 class DegenerateContacts(GraspError, ValueError):
-    """Three contacts lie on a line or in a point, so they have no virtual frame."""
+    """Three contacts lie on a line or in a point, so they define no coordinate frame."""
 
 
 class BrokenLaw(GraspError, AssertionError):
-    """A hand breaks a law of `torchgrasp.testing`; `law` is its name.
+    """The kinematics of a hand break a law that `torchgrasp.testing` checks; `law` is its name.
 
     >>> error = BrokenLaw("order", "2 nan", "finite numbers")
     >>> error.law, str(error)
@@ -127,7 +127,7 @@ class TwoBodies(CloudWarning):
 
 
 class Status(enum.IntEnum):
-    """The outcome of one row of a batch; `sentence` explains it.
+    """The outcome of one row of a batch, such as one grasp; `sentence` explains the outcome.
 
     >>> Status.NOT_CLOSED.sentence
     'the contacts do not resist every wrench at the planned friction (no frictional form closure)'

@@ -34,13 +34,13 @@ def run_tasks(
     Each task runs on one thread of a separate process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task
     whose process dies twice gives `Status.WORKER_DIED`. All workers end when the caller stops iterating.
 
-    A worker imports the module of the function. Tasks hold no tensors, because processes would share them. Without
-    workers the tasks run in this process, without a time `limit` [s].
+    Each worker imports the module of the function. Tasks must hold no tensors, because processes would share them. If
+    `workers` is 0, the tasks run in this process, without the `limit` [s] on the time of a task.
 
     Raises:
         BadArgument: workers outside [0, 1024], or a limit below 1 ms.
         MissingExtra: pebble is not installed.
-        Exception: the error of a task, when its turn comes.
+        Exception: the error of a task, raised in place of its result.
     """
     return _in_order(_run(function, tasks, workers, limit))
 
@@ -48,7 +48,7 @@ def run_tasks(
 def run_as_they_end(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Run tasks as `run_tasks`; yield the index and the result of each task, in the order in which they end."""
+    """Run tasks like `run_tasks`, but yield the index and the result of each task as soon as it ends."""
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
         for number, ended in results:
             yield number, ended if isinstance(ended, Status) else ended.result()
@@ -71,7 +71,7 @@ def _in_order(
 def _run(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Run the tasks; yield index and result as they end. A broken pool of worker processes is replaced."""
+    """Run the tasks; yield the index and the result of each when it ends. A broken pool of processes is replaced."""
     if not workers:
         for number, task in enumerate(tasks):
             future = Future[Result]()
@@ -96,7 +96,7 @@ def _run(
 def _run_pool(
     function: Callable[..., Result], waiting: deque[tuple[int, Task]], died: set[int], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Run `waiting` tasks by index in one pool until all end or the pool breaks; `died` are those that died once."""
+    """Run `waiting` tasks in one pool until all end or the pool breaks; `died` are tasks whose process died once."""
     try:
         from pebble import ProcessExpired, ProcessPool
     except ImportError as error:
@@ -140,7 +140,7 @@ def _run_pool(
 
 
 def _begin(function: Callable[..., Any]) -> None:
-    """Prepare a worker process: one thread, and it ends with its parent."""
+    """Prepare a worker process: it uses one torch thread, and it ends when its parent process ends."""
     torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     assert parent is not None

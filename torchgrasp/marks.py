@@ -1,4 +1,4 @@
-"""Marks in type annotations, such as ranges, and the rules of argument validation (`torchgrasp.checks`)."""
+"""Rules that type annotations carry, such as ranges, and helpers of argument validation (`torchgrasp.checks`)."""
 
 import collections.abc
 import os
@@ -17,7 +17,7 @@ from torchgrasp.limits import NAME_BYTES, PATH_BYTES, SHOWN_LETTERS
 
 
 class Range(NamedTuple):
-    """A range mark: numbers from `low` to `high` are allowed, both included; an error shows `words`."""
+    """A rule in an annotation: a number must lie in [`low`, `high`]. `words` describe the range in errors."""
 
     low: float
     high: float
@@ -31,9 +31,9 @@ class Rows(NamedTuple):
 
 
 ANY, FINITE = "any number, NaN and infinity too", "finite numbers in every field"
-"""Marks of annotations. Tensors must be finite, unless marked `ANY`; `FINITE` asks so of all fields of a value."""
+"""Rules in annotations. Tensors must be finite unless annotated `ANY`; `FINITE` demands it of all fields of a value."""
 RIGID = "a rigid transform: a right-handed rotation, and the row 0 0 0 1"
-"""The mark of transforms: a matrix that scales or mirrors would give wrong results without an error."""
+"""The rule for transforms: a matrix that scales or mirrors would give wrong results without an error."""
 LEAST, MOST = sys.float_info.min, sys.float_info.max  # least positive and largest finite number
 Seed = Annotated[int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")]  # a seed of random draws
 Count = Annotated[int, Range(1, 1_000_000)]  # a number of objects that are kept in memory
@@ -46,7 +46,7 @@ Length = Annotated[float, Range(0.0, 10.0)]  # a length [m] within reach
 DTYPES = {"Float": (torch.float32, torch.float64), "Int": (torch.int64, torch.int32), "Bool": (torch.bool,)}
 """The dtypes that each kind of annotation allows."""
 NUMBERS = {int: Range(-(2**63), 2**63 - 1, "a whole number"), float: Range(-MOST, MOST, "a finite number")}
-"""The ranges of numbers whose annotation has none."""
+"""The ranges of numbers whose annotation gives no range."""
 
 
 def describe(hint: Any) -> str:
@@ -78,7 +78,7 @@ def is_tensor(hint: Any) -> bool:
 
 
 def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool:
-    """Return whether a shape fits jaxtyping's axes, and record the letters' sizes, which jaxtyping would forget."""
+    """Return whether a shape matches the axes of a jaxtyping annotation; record the size of each letter in `sizes`."""
     for k in [k for k, axis in enumerate(axes) if axis[0] in "*."]:
         letter, end = axes[k].lstrip("*#"), len(shape) - (len(axes) - k - 1)
         if end < k:
@@ -104,7 +104,7 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
 
 
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
-    """Raise `BadArgument` for a sparse, nested or meta tensor, or one that requires gradients where none may."""
+    """Raise `BadArgument` for a sparse, nested or meta tensor, or if it requires a gradient without `gradients`."""
     if value.layout is not torch.strided or value.is_nested or value.is_meta:
         found = "no numbers (meta)" if value.is_meta else f"a layout of {value.layout}"
         raise BadArgument(name, found, "a dense tensor with numbers")
@@ -115,7 +115,7 @@ def check_dense(name: str, value: Tensor, gradients: bool) -> None:
 
 
 def show(value: Any) -> str:
-    """Return a text for a wrong argument: numbers and texts as they are, tensors by shape, others by type."""
+    """Return a text that shows a wrong argument: a number or text itself, the shape of a tensor, or the type."""
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
     if value is None or isinstance(value, str | int | float):
@@ -126,7 +126,7 @@ def show(value: Any) -> str:
 
 
 def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Return which matrices are rigid transforms, a right-handed rotation (up to float32 rounding) and translation."""
+    """Return a mask of the matrices that are a right-handed rotation (up to float32 rounding) and a translation."""
     x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
     rotation, eye = torch.stack([x, y, z], -2), torch.eye(4, dtype=torch.float64, device=a_from_b.device)
     error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))

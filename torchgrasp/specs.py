@@ -13,23 +13,23 @@ Simulator = Literal["sapien", "mujoco"]
 """The simulators."""
 
 TIP_RADIUS, SEPARATION = 0.012, 0.026
-"""Default radius [m] of a fingertip, and least distance [m] between two: smaller tips have wider links behind them."""
+"""Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind smaller fingertips."""
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
-"""Radii [m] within which the surface at a contact is flat; the largest that the object allows is used."""
+"""Radii [m] within which the surface at a contact must be flat; the largest that the object allows is used."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactSpec(Value):
-    """The constraints on three to five contacts (Eqs. 10-14). `ContactSpec.paper()` gives the paper's.
+    """The constraints on three to five contacts (Eqs. 10-14). `ContactSpec.paper()` returns those of the paper.
 
     The estimated surface differs from the true one, so the defaults keep larger margins than the paper: a lower
     friction, a flat surface, and a distance between fingertips.
 
     Args:
         friction: coefficient of friction between fingertip and object at execution.
-        edges: edges of the linearised friction cone, at least 3.
-        max_variance: S_thresh of Eq. (12), a variance in normalised units.
+        edges: number of edges of the linearised friction cone, at least 3.
+        max_variance: largest variance of the surface at a contact, S_thresh of Eq. (12), in normalised units.
         friction_margin: contacts are planned and certified with `friction * friction_margin`.
         separation: least distance between the centres of two fingertips [m]; by default their diameter plus 2 mm.
             Contacts on opposite sides of a thin object may be closer.
@@ -64,7 +64,7 @@ class ContactSpec(Value):
 
     @property
     def plane(self) -> Plane | None:
-        """The table as a plane."""
+        """The table as a plane, or None if there is no table."""
         return as_plane(self.table)
 
     @property
@@ -95,7 +95,7 @@ class ContactSpec(Value):
 
     @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
-        """Return the spec for fingertips of a radius [m], at least `TIP_RADIUS`, unless `tip_radius` is set.
+        """Return the spec with `tip_radius` set to a radius [m], at least `TIP_RADIUS`, unless it is set already.
 
         >>> wide, points = ContactSpec().for_fingertips(0.015), ContactSpec(tip_radius=0.0).for_fingertips(0.015)
         >>> wide.tip_radius, points.tip_radius
@@ -108,7 +108,7 @@ class ContactSpec(Value):
     def paper(
         cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03, table: Plane | float | None = None
     ) -> "ContactSpec":
-        """Return the paper's constraints: full friction, no separation, no flatness, contacts above the table.
+        """Return the paper's constraints: full friction, contacts above the table, no least separation or flatness.
 
         >>> ContactSpec.paper(friction=0.8).planned_friction, ContactSpec.paper().flatness
         (0.8, None)
@@ -120,19 +120,20 @@ class ContactSpec(Value):
 Mode = Literal["joint", "contact_first", "paper"]
 """How planned contacts become grasps.
 
-* "joint": seeds are random postures near each set of contacts. If none succeeds, the contacts slide with the hand.
-* "contact_first": seeds of the learned model are refined onto fixed contacts.
-* "paper": the paper's chain (docs/paper.md): seeds of the model by Eqs. 21-24, refined by COBYLA, and the paper's
-  shape, contacts and ranking.
+* "joint": the hand starts from random postures near each contact set. If none succeeds, the contacts move along the
+  surface with the hand.
+* "contact_first": initial postures of the learned model are refined onto fixed contacts.
+* "paper": the paper's method (docs/paper.md): initial postures of the model by Eqs. 21-24, refined by COBYLA, and the
+  paper's shape, contacts and ranking.
 """
 Ranking = Literal["success", "variance"]
 """Which grasp is the best: the one with the highest predicted success, or the least sum of variances (the paper's)."""
 
 ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper", "uncertainty"]
-"""How a hand closes, see `TrialSpec`."""
+"""How a hand closes; `TrialSpec` explains the modes."""
 
 HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
-"""How a closed hand presses, see `TrialSpec`."""
+"""How a closed hand presses; `TrialSpec` explains the modes."""
 
 
 @checked
@@ -160,14 +161,14 @@ class TrialSpec(Value):
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         force: desired normal force of the strongest finger [N].
-        noise: whether the sensor is noisy; a tactile one: 0.1 N normal, 0.3 N tangential, 1.5 mm of contact position.
+        noise: whether the sensor is noisy; for a tactile sensor 0.1 N normal, 0.3 N tangential and 1.5 mm of position.
         timestep: timestep of the simulator [s].
         control_rate: rate of the controller [Hz].
         simulator: "sapien" or "mujoco".
         density: density of the object [kg/m^3]; it replaces `mass` unless None.
         patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x force x patch.
         kp: stiffness of all joint drives [N m/rad]; by default the hand's own.
-        overlap: largest overlap [m] at the start; convex parts bulge a little.
+        overlap: largest overlap [m] of hand and object at the start; the object's convex parts bulge a little.
         table: whether the object stands on a table.
         self_collision: whether links of the hand collide with each other, in the pairs that the hand names.
 
@@ -204,7 +205,7 @@ class TrialSpec(Value):
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
 
     def __post_init__(self) -> None:
-        """Check fields that depend on each other."""
+        """Raise `BadArgument` if fields contradict each other."""
         choose_options(self.closing, self.options)
         check_modes(self.sensor, self.closing, self.holding)
         if self.max_force is not None and self.force > self.max_force:
@@ -215,12 +216,12 @@ class TrialSpec(Value):
 
     @property
     def components(self) -> ClosingOptions:
-        """The components of the closing mode."""
+        """The options of the closing mode, all off for modes without options."""
         return choose_options(self.closing, self.options)
 
 
 def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
-    """Raise `BadArgument` for modes that do not go together, or that need more than the sensor measures."""
+    """Raise `BadArgument` if the closing and holding modes do not combine, or need more than the sensor measures."""
     if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
         raise BadArgument("holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)")
     poor = f"one of kind {sensor.kind!r}" + (f" with {', '.join(sensor.dead)} dead" if sensor.dead else "")

@@ -28,8 +28,8 @@ FK_TOLERANCE = 1e-8  # largest difference [m, and entries of rotations] from the
 def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Check a hand, shipped or in a folder, with a choice of grasping fingers, and return it.
 
-    The rules for the files concern coupling, limits, drives, masses, pads, parked joints and self-collision. The laws
-    for the loaded hand are, as errors name them:
+    The rules for the files concern coupling, limits, drives, masses, pads, parked joints and self-collision. The
+    kinematics of the loaded hand must obey these laws, which errors name:
 
     * `kinematics`: the poses of all links are those of pytorch-kinematics and of yourdfpy.
     * `jacobian`: the Jacobian of the fingertips equals central differences.
@@ -38,7 +38,7 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     Raises:
         HandFileError: a file breaks a rule; the message names the file, what was found and what is allowed.
         BadArgument: the hand has no such fingers.
-        BrokenLaw: the first law that is broken.
+        BrokenLaw: the kinematics break a law; the error names the first.
 
     >>> check_hand("barrett").name
     'barrett'
@@ -61,7 +61,7 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 
 def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
-    """Compare the Jacobian with central differences, and the rows of a batch with single postures."""
+    """Raise `BrokenLaw` if the Jacobian differs from central differences, or a row of a batch from a single posture."""
     # Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian
     step, allowed = 1e-6, 1e-6
     steps = step * torch.eye(hand.dof, dtype=torch.float64)
@@ -79,7 +79,7 @@ def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
 
 
 def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Iterator[HandFileError]:
-    """Yield an error for every broken rule of a hand's files; raises as `load_hand` if the hand cannot be loaded."""
+    """Yield an error for each rule that a hand's files break; raise the error of `load_hand` if it cannot load them."""
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf, hand = read_urdf(spec.urdf), load_hand(name_or_path, fingers)
     yield from _wrong_bodies(urdf)
@@ -150,7 +150,7 @@ def _inside(point: np.ndarray, shape: Shape) -> bool:
 
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
-    """Return the largest difference of link poses from yourdfpy's and pytorch-kinematics', and the link's name."""
+    """Return the largest difference of link poses from yourdfpy and pytorch-kinematics, and the name of the link."""
     import yourdfpy
 
     urdf, poses = read_urdf(hand.urdf_path), hand.link_poses(joints).double()
@@ -165,7 +165,7 @@ def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, s
 
 
 def reference_poses(urdf: Urdf, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-    """Return `root_from_link` of every link, computed by pytorch-kinematics in the dtype of `values`."""
+    """Return every link's pose in the root's frame by pytorch-kinematics; `values` are the positions of all joints."""
     chain = chain_from_urdf(urdf, values.dtype)
     names = [j.name for j in urdf.movable]
     order = [names.index(name) for name in chain.get_joint_parameter_names()]

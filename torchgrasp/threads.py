@@ -38,7 +38,7 @@ def one_thread() -> Iterator[None]:
 
 
 def single_threaded(function: Function) -> Function:
-    """Return a function that runs within `one_thread`; a generator runs within it for each item."""
+    """Return the function limited to one torch thread; a generator is limited while it computes each item."""
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -50,7 +50,7 @@ def single_threaded(function: Function) -> Function:
 
 
 def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
-    """Yield the items of a generator, each computed within `one_thread`."""
+    """Yield the items of a generator, each computed with one torch thread."""
     with contextlib.closing(items):
         while True:
             with one_thread():

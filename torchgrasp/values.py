@@ -1,4 +1,4 @@
-"""The values of the data flow, in its order. Options are in `torchgrasp.specs`.
+"""The values that the stages of planning exchange, in the order of the stages. Options are in `torchgrasp.specs`.
 
 A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths are in metres.
 Positions are in the frame of the cloud ("obj") unless stated otherwise. `a_from_b` maps coordinates of frame b into a.
@@ -90,11 +90,11 @@ class PointCloud(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ShapeEstimate(Value):
-    """The estimated shape at query points: posterior of signed distance and normal (Eqs. 7-8).
+    """The estimated shape at query points: posterior of signed distance and normal (Eqs. 7-8 of the paper).
 
-    `distance`, `variance` and `covariance` are in the normalised units of the paper: one unit is `shape.scale` metres.
-    `normal` is the unit gradient of the mean. `std_m` [m] is the calibrated standard deviation of the surface:
-    the deviation of the distance over the slope of the mean.
+    `distance`, its `variance`, and the `covariance` of distance and gradient are in the normalised units of the paper:
+    one unit is `shape.scale` metres. `normal` is the unit gradient of the mean distance. `std_m` [m] is the calibrated
+    standard deviation of the surface: that of the distance, divided by the slope of the mean.
     """
 
     distance: Float[Tensor, "*b"]
@@ -144,10 +144,10 @@ class Contacts(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactPlan(Batch):
-    """Planned contact sets, one for each initial guess, in their order.
+    """Planned contact sets, one for each initial guess, in the order of the guesses.
 
-    `coefficients` is phi of Eq. (13). `quality` is Eq. (14), the distance [m] of the contacts' centroid from the
-    cloud's centre; less is better.
+    `coefficients` are phi of Eq. (13) of the paper: weights of the edges of the friction cones at which the forces
+    balance. `quality` is Eq. (14), the distance [m] of the contacts' centroid from the cloud's centre; less is better.
     """
 
     contacts: Annotated[Contacts, Rows("b")]
@@ -159,7 +159,7 @@ class ContactPlan(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """The proof that contact sets have frictional form closure (Eq. 13), or that they have not; see `certify`.
+    """The proof that contact sets have frictional form closure (Eq. 13), or that they have not; `certify` makes it.
 
     The columns of W are the wrenches along the edges of the friction cones, with torques divided by the radius of the
     contacts; phi are their coefficients. `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio`
@@ -179,10 +179,11 @@ class Certificate(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
-    """The frame-invariant code q = (L, N) of Eq. (18) for the six assignments of contacts to fingers.
+    """The code q of sets of three contacts, independent of the frame, for six assignments to fingers (Eq. 18).
 
-    In assignment k finger i touches contact `permutation[k, i]`. Degenerate contact sets have NaN and a `status` other
-    than OK.
+    q holds the distances [m] of the contacts from their centroid, then the cosines between their normals.
+    `obj_from_vf` is the pose of a frame that the contacts define. In assignment k finger i touches contact
+    `permutation[k, i]`. Contact sets on a line or in a point have NaN and a `status` other than OK.
     """
 
     q: Annotated[Float[Tensor, "b 6 6"], ANY]
@@ -194,11 +195,11 @@ class ContactCode(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSeeds(Batch):
-    """Initial guesses for inverse kinematics: postures placed on contacts by their virtual frames (Eq. 24).
+    """Initial guesses for inverse kinematics: postures whose fingertips are placed on contacts (Eq. 24 of the paper).
 
-    `row` is the index of the contact set, `permutation` the contact of each finger. `energy` is the least f_i of Eq.
-    (21), or half the squared feature distance of a library posture. `tip_error` [m] is the distance of each fingertip
-    from its contact.
+    `row` is the index of the contact set, `permutation` the contact of each finger. `energy` is the misfit of the
+    posture, the least f_i of Eq. (21) or half the squared feature distance of a library posture; less is better.
+    `tip_error` [m] is the distance of each fingertip from its contact.
     """
 
     joints: Float[Tensor, "g h"]
@@ -214,12 +215,12 @@ class IKSeeds(Batch):
 class Grasps(Batch):
     """Grasps: hand configurations with their contacts, certificates and checks, best first.
 
-    Finger i touches contact i. `pregrasp` is the joints of the opened hand at the same pose; `approach` is the unit
-    direction of its straight path there. `clearance` [m] is the least distance of the links from the estimated
-    surface, from each other and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle
-    between pad axis and contact direction. `score` is the log-odds of the predicted success, which ranks the grasps.
-    `known` tells where trials support the prediction; None means everywhere. `meta` holds names, units, hashes and the
-    seed as text.
+    Finger i touches contact i. `pregrasp` are the joints of the opened hand at the same pose; `approach` is the unit
+    direction in which the opened hand moves straight to this pose. `clearance` [m] is the least distance of the links
+    from the estimated surface, from each other and from the table; fingertips may touch the surface. `normal_angle`
+    [rad] is the angle between pad axis and contact direction. `score` is the log-odds of the predicted success, which
+    ranks the grasps. `known` tells for which grasps trials support the prediction; None means for all. `meta` holds
+    names, units, hashes and the seed as text.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
@@ -260,7 +261,7 @@ class Grasps(Batch):
 
 
 def format_success(success: "Grasps | float") -> str:
-    """Return a predicted success, or that of the first grasp, as text: a percentage, or "unknown"."""
+    """Return a predicted success as a percentage, or "unknown" for NaN; of grasps, the success of the first."""
     number = float(success.success[0]) if isinstance(success, Grasps) else success
     return "unknown" if number != number else f"{number:.0%}"
 
@@ -270,7 +271,7 @@ def load_grasps(path: Path | str) -> Grasps:
     """Read grasps that `Grasps.save` wrote.
 
     Raises:
-        ModelFileError: no such file, a pose that is not rigid, an unknown status, or not three to five contacts.
+        ModelFileError: the file is missing, or a pose, a status or the number of contacts is not valid.
 
     >>> import tempfile
     >>> from torchgrasp.data.shipped import load_shipped_grasp
