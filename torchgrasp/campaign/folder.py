@@ -21,7 +21,7 @@ FAILED = (Status.WORKER_DIED, Status.TIMED_OUT, Status.BROKEN)
 """Statuses of a failed job that say nothing about its object: the next call tries the job again."""
 
 Work = Callable[[Sequence[int]], Generator[tuple[int, bytes | Status], None, None]]
-"""Takes indices of jobs. As each job ends, it yields a position in these indices and a file, or a process failure."""
+"""Function of job indices that yields, as each job ends, a position in these indices, and a file or a failure."""
 FIELDS = (
     ("points", "p x 3", "cloud of each job, one behind the other [m]"),
     ("viewpoints", "j x 3", "position of the camera [m]; zeros: unknown"),

@@ -106,7 +106,7 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
 
 @checked
 def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0) -> list[str]:
-    """Make a folder of objects from a folder of mesh files; return the objects' names, which are the file names.
+    """Make a folder of objects from a folder of mesh files; return the objects' names, the file names without suffix.
 
     Each mesh is moved so that its lowest point is at z = 0 and the middle of its box above the origin. Each view is
     rendered by the depth camera of `partial_view` from a random side. The manifest is written last, so that a folder

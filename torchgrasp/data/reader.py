@@ -41,7 +41,7 @@ class GraspShards:
 
     `len` counts the grasps. Item i is a dict of float32 tensors [m, rad] in the object's frame: `points` (n, 3) and
     `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach` (3,), `obj_from_hand` (4, 4); `contacts` and
-    `normals` (f, 3), `std_m` (f,); `margin` and `witness` (6,) of the certificate; `clearance`; `predicted` success;
+    `normals` (f, 3), `std_m` (f,); `margin` and `witness` (6,) as in `Certificate`; `clearance`; `predicted` success;
     `simulated`, the fraction of simulated trials that passed. `closed` (a bool) tells whether the grasp has force
     closure, `job` is the index in `jobs`.
 
@@ -95,7 +95,7 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Read job j, in the precision of the file.
+        """Return job j, with all numbers in the precision of the file.
 
         Raises:
             IndexError: no such job.

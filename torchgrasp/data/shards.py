@@ -26,7 +26,7 @@ class JobRow(NamedTuple):
 
     `status` is OK, or the reason why there is no grasp: the most frequent failure, a bad object, or how the process
     ended. `note` gives details. `executable` grasps were planned; `grasps` of them were kept and tried; `passed` is the
-    number of trials that passed. `points` is the size of the cloud. `meta` is that of `Grasps`.
+    number of trials that passed. `points` is the size of the cloud. `meta` is the metadata of its `Grasps`.
 
     >>> JobRow("mug", "view0", Status.NOT_CLOSED, points=1000).as_json()["status"]
     'NOT_CLOSED'
@@ -51,7 +51,7 @@ class JobRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Records(Value):
-    """The tensors of several jobs, concatenated.
+    """The tensors of several jobs: those of the first job, then those of the next.
 
     Letters: p points, j jobs, g grasps, d trials of a grasp. A job without a camera has a viewpoint of zeros. `passed`
     and `outcome` (a `Status`) are for each simulated trial. Lengths are in metres, in the object's frame.

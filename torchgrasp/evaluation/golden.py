@@ -34,7 +34,7 @@ GOLDEN = (
 
 
 class GoldenResult(NamedTuple):
-    """A golden case and its verdict in simulation; `seconds` is wall time."""
+    """A test case, whether the simulated hand held the object, and the wall time of the trial in seconds."""
 
     case: GoldenCase
     held: bool
@@ -42,13 +42,13 @@ class GoldenResult(NamedTuple):
 
     @property
     def right(self) -> bool:
-        """Whether the simulated verdict is the expected one."""
+        """Whether the simulated hand held or lost the object as expected."""
         return self.held == self.case.held
 
 
 @checked
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
-    """Simulate each case of `GOLDEN`, and yield the results."""
+    """Simulate each test case of `GOLDEN`, and yield its result."""
     for case in GOLDEN:
         thing, hand = load_object(case.object), load_hand(case.hand)
         grasp = load_shipped_grasp(case.object, case.hand)

@@ -50,7 +50,7 @@ def _sum_by(values: Iterable[tuple[str, int | float]]) -> dict[str, tuple[int | 
 def share_over(counts: Counts, seed: Seed = 0) -> Share:
     """Return the success rate over all trials, with its 95 % interval from resampling the units.
 
-    If all trials passed, or none, the bootstrap has no width. The interval is then the one-sided 95 % bound of n
+    If all trials passed, or none, resampling gives no width. The interval is then the one-sided 95 % bound of n
     independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
     """
     found = contrast_over([counts], [1.0], seed)

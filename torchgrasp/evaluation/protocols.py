@@ -69,7 +69,7 @@ _FLOATING = TrialSpec(
     closing="open_loop", force=7.0, mass=0.1, friction=0.6, patch=0.02 / 0.6, kp=5.0, overlap=0.01,
     gravity=0.0, table=False, approach=0.0, lift_height=0.0,
 )  # fmt: skip
-"""DexGraspBench's trial. PhysX resists torsion by friction x force x patch [m], the ratio of both frictions."""
+"""DexGraspBench's trial. PhysX resists torsion by friction x force x patch: torsional over sliding friction [m]."""
 
 _PULL = PullSpec(10.0, 2.0, 0.05, math.radians(15))  # DexGraspBench's
 

@@ -68,7 +68,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Pull at the grasped object in each direction, each in a fresh scene, until a pull fails."""
+    """Grasp and pull the object in each direction, each time in a fresh scene, until one pull fails."""
     started = time.process_time()
     status, largest, force, tried = Status.OK, np.zeros(2), math.nan, 0
     while status is Status.OK and tried < len(DIRECTIONS):

@@ -94,7 +94,7 @@ class ViewScore(Value):
 
 @checked
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the numbers of an evaluation by name; intervals are over families of objects.
+    """Return the figures of an evaluation by name; their 95 % intervals resample families of objects.
 
     * "gsr": grasp success rate, the fraction of trials that passed.
     * "top1": fraction of best-ranked grasps that passed; a view without grasps counts as failed.

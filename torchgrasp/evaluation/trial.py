@@ -152,7 +152,7 @@ class TrialRun:
         return self.overlap <= self.spec.overlap
 
     def approach(self) -> Iterator[None]:
-        """Move the opened hand straight to its pre-grasp; if the approach is guarded, a touch stops the hand."""
+        """Move the opened hand straight to its pre-grasp; in a guarded approach, a touch stops the hand."""
         speed = 0.2  # mean speed [m/s] of an unguarded approach
         if self.controller.approaching:
             self.observation = self.robot.tick(self.controller.targets)

@@ -85,7 +85,7 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A view of a dataset object and a hand, identified by their files."""
+    """A hand and a view of an object: the input of one planning task, named by the files of both."""
 
     objects: Path
     object: str

@@ -183,7 +183,7 @@ class Report:
     """Reports progress to the observer: each stage once with the results of all batches, and the end of each batch."""
 
     def __init__(self, problem: Problem, batches: int, planned: int) -> None:
-        """Take the number of batches, and the number of batches that plan new initial guesses."""
+        """Take the number of all `batches`, and the number `planned` of those batches that plan new initial guesses."""
         self.problem, self.batches, self.planned = problem, batches, planned
         self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
         self.ended = self.offered = self.closed = 0
@@ -199,7 +199,7 @@ class Report:
         self.problem.tell("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
 
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
-        """Store the result of a stage of one batch; `offered` contact sets were given to the stage "certify"."""
+        """Store the result of one stage of one batch; `offered` is how many contact sets stage "certify" checked."""
         if stage == "query":  # rows are counted through all batches
             value = dataclasses.replace(value, row=value.row + self.closed - len(self.parts["certify"][-1]))
         elif stage == "certify":
@@ -233,6 +233,6 @@ class Report:
 
 
 def describe(counts: dict[Status, int]) -> str:
-    """Return the counts of statuses as one line of text, successes first."""
+    """Return how often each status occurs as one line of text, the successes first."""
     ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
     return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"

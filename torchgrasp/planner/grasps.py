@@ -131,9 +131,9 @@ def stream_grasps(
 ) -> Iterator[Grasps]:
     """Yield the executable grasps of each batch of `plan_grasps` when the batch ends, best first.
 
-    Each grasp is certified, checked and scored. All batches together, ranked, are the executable grasps of
-    `plan_grasps` with the same arguments. The work stops when the caller stops iterating. In modes other than "joint",
-    and with "auto" fingers, there is one batch.
+    Each grasp has force closure, has passed all checks, and is scored. All batches together, ranked, are the executable
+    grasps of `plan_grasps` with the same arguments. The work stops when the caller stops iterating. In modes other than
+    "joint", and with "auto" fingers, there is one batch.
 
     Args:
         cloud: this and all other arguments: see `plan_grasps`.
@@ -291,7 +291,7 @@ def _with_arrays(value: Any) -> Any:
 
 
 def _with_tensors(sent: Any) -> Any:
-    """Return the value that `_with_arrays` packed, with tensors again."""
+    """Return the value that `_with_arrays` packed, with tensors in place of the arrays."""
     if isinstance(sent, np.ndarray):
         return torch.from_numpy(sent)
     if isinstance(sent, tuple) and isinstance(sent[0], type):

@@ -43,7 +43,7 @@ TARGET_POINTS = 1000  # most points of a scene's target that are used: they lie 
 Budget = Annotated[float, Range(1e-3, math.inf)]
 """A time budget [s]."""
 Observer = Callable[[str, str, Any], None]
-"""Called after each stage with the stage's name, a line of text, and the stage's value."""
+"""Function that is called after each stage with the stage's name, a line of text, and the stage's result."""
 
 
 def ignore(stage: str, message: str, value: Any) -> None:
@@ -240,7 +240,7 @@ class Problem:
         return GraspProblem(self.hand, contacts, certificate, self.world, self.center, self.reachable)
 
     def tell(self, stage: str, message: str, value: Any) -> None:
-        """Report a stage to the observer, with its value in the caller's frame."""
+        """Report a stage to the observer, with the result of the stage in the caller's frame."""
         if self.request.observer is not ignore:
             self.request.observer(stage, message, self._moved(value))
 
@@ -287,5 +287,5 @@ def take_target(scene: Scene, seed: Seed) -> PointCloud:
 
 
 def digest(cloud: PointCloud) -> str:
-    """Return the SHA-256 of a cloud's points; grasps store it as the identity of their input."""
+    """Return the SHA-256 of a cloud's points; grasps store it to identify the cloud that they were planned on."""
     return hashlib.sha256(cloud.points.detach().cpu().double().contiguous().numpy().tobytes()).hexdigest()

@@ -79,7 +79,7 @@ def plan_scene(
 ) -> ScenePlan:
     """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
-    Nothing is planned for an object that the hand cannot grasp as its image shows (`Status.FEW_PIXELS` to `TOO_VAGUE`).
+    Nothing is planned for an object if its image shows that it cannot be grasped (`Status.FEW_PIXELS` to `TOO_VAGUE`).
     Of the other objects, near and tall ones with free space around them are planned first. Objects that are larger than
     all objects in our trials, or cut off by the image border, are planned last.
 
