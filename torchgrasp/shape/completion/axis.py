@@ -1,7 +1,8 @@
 """Bodies of revolution: their axis is the line that most surface normals meet.
 
 The lines along the normals of a surface of revolution meet its axis: they lie in a linear line complex of pitch 0
-(Pottmann and Wallner, Computational Line Geometry, 2001). The miss, moment times direction, is linear in either factor.
+(Pottmann and Wallner, Computational Line Geometry, 2001). The distance by which a normal's line misses the axis is the
+moment of the normal about a point of the axis times the axis direction: it is linear in either factor.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ from torchgrasp.shape.completion.symmetry import PROBES, SymmetryScorer
 HALF_WEIGHT = 0.004  # distance [m] of a normal's line from the axis at which it has half the weight in the fit
 STEEP = 0.3  # least length of the level part of the normals that fit a vertical axis
 MISS, LEAST_RADIUS = 0.2, 0.01
-"""A normal meets the axis if its line passes it within this share of the point's radius, at least of this one [m]."""
+"""A normal meets the axis if its line passes within MISS times the point's radius, or LEAST_RADIUS [m] if greater."""
 ROUNDNESS, ROUND_ERROR = 0.055, 0.0018  # usual miss of a body's normals: a share of the radius and an error [m]
 MAX_SPREAD = 0.075  # greatest RMS of the relative misses of an upright body's normals
 BODY_SHARE = 0.6  # least share of the cloud on the body; other points are an attached part
@@ -32,16 +33,17 @@ MAX_FREE = 0.12  # greatest share of the rotated body in free space
 
 @dataclasses.dataclass(frozen=True)
 class Revolution:
-    """A body of revolution about the vertical axis at `center` [m]; `body` masks its points."""
+    """A body of revolution about the vertical axis at `center` (x, y) [m]; `body` is the mask of its cloud points."""
 
     center: Float[Tensor, "2"]
     body: Bool[Tensor, "n"]
 
 
 def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution] | None:
-    """Return the frame `axis_from_cloud` of an axis of revolution, and the body about its z axis, or None.
+    """Return `axis_from_cloud`, the transform to a frame whose z axis is an axis of revolution, and the body about it.
 
-    The axis is fitted to the scorer's probes. The body, rotated about it, must stay out of free space and the table.
+    Return None if there is no such body. The axis is fitted to sampled points of the scorer. The body, rotated about
+    the axis, must stay out of free space and out of the table.
     """
     center, direction, cost = _fit_axis(*scorer.probes)
     if not cost < MAX_COST:
@@ -71,14 +73,14 @@ def find_revolution(points: Points, normals: Points) -> Revolution | None:
 
 
 def fit_axis(points: Points, normals: Points) -> Float[Tensor, "2"]:
-    """Return the vertical axis, as a point (2,) [m], that most lines along the normals meet."""
+    """Return x and y [m] of the vertical axis that most lines along the surface normals meet."""
     return _fit_to_lines(points, _lines_from_above(points, normals))
 
 
 class _Lines(NamedTuple):
-    """Lines along normals, seen from above: points x with across . x = offset; `slope`, `level`: length and direction.
+    """Lines along surface normals, seen from above: each line consists of the points x with across . x = offset [m].
 
-    `steep` says whether the horizontal part of a normal is long enough.
+    `slope` and `level` are the length and direction of a normal's horizontal part; `steep` masks parts long enough.
     """
 
     slope: Float[Tensor, "n"]
@@ -98,7 +100,7 @@ def _lines_from_above(points: Points, normals: Points) -> _Lines:
 
 
 def _fit_to_lines(points: Points, lines: _Lines) -> Float[Tensor, "2"]:
-    """Return the point (2,) that most lines meet, by reweighted least squares (Cauchy)."""
+    """Return the point (x, y) [m] that most lines meet, by reweighted least squares (Cauchy)."""
     miss, center = torch.zeros_like(lines.offset), points[:, :2].mean(0)
     for _ in range(30):
         weight = lines.slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
@@ -110,9 +112,10 @@ def _fit_to_lines(points: Points, lines: _Lines) -> Float[Tensor, "2"]:
 def _round_body(
     points: Points, lines: _Lines, center: Float[Tensor, "2"], allowed: Callable[[Tensor, Tensor], Tensor]
 ) -> Bool[Tensor, "n"] | None:
-    """Return the mask of a body about a vertical axis; None if it is not round, a small part, or one flat side.
+    """Return the mask of the points on a body of revolution about a vertical axis at `center`.
 
-    The normals of a body meet the axis, and its radius is typical of the height. `allowed` returns the RMS [m] by which
+    Return None if the body is not round, has too few points, or shows only one flat side. Normals on the body meet the
+    axis, and its points have the typical radius of their height. `allowed` returns the RMS [m] by which
     normals may miss the axis, given the radius of each point and the typical radius at its height.
     """
     miss = lines.offset - lines.across @ center
@@ -129,7 +132,7 @@ def _round_body(
 
 
 def _fit_axis(points: Points, normals: Points) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], float]:
-    """Return a point [m] of the axis that most lines along the normals meet, the axis direction, and the cost."""
+    """Return a point [m] and the direction of the axis that most lines along the normals meet, and the fit's cost."""
     starts = 12  # Gauss-Newton steps with robust weights (Cauchy) from so many directions; each narrows the weights
     direction = fibonacci_sphere(2 * starts)[:starts]
     center, cost = points.mean(0).expand_as(direction), torch.zeros(starts, dtype=torch.float64)
@@ -157,7 +160,7 @@ def _fit_axis(points: Points, normals: Points) -> tuple[Float[Tensor, "3"], Floa
 
 
 def _frame(center: Float[Tensor, "3"], direction: Float[Tensor, "3"], outline: Outlines) -> Float[Tensor, "4 4"]:
-    """Return `axis_from_cloud`, with x towards the cameras unless they look along the axis."""
+    """Return the transform to a frame at `center` with z along the axis and, if possible, x towards the cameras."""
     eye = torch.stack([view.viewpoint for view in outline.views]).mean(0) - center
     level = eye - (eye @ direction) * direction
     length = torch.linalg.vector_norm(level)

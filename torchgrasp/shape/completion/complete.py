@@ -36,7 +36,7 @@ TEMPERATURE = 0.1  # a plane's probability is proportional to exp(score / temper
 NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045  # planes near a plane: steps of an axis, angle [rad], shift / size
 
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
-"""What a hidden side follows from: an ellipsoid, an axis, mirror planes, or nothing but the outline."""
+"""What the hidden side was estimated from: an ellipsoid, an axis, mirror planes, or only the outline (a guess)."""
 SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 
 
@@ -74,14 +74,17 @@ class Completion(Value):
 
     @property
     def deviations(self) -> Float[Tensor, "m k"]:
-        """The correlated errors D [m], one column for each independent cause."""
+        """The correlated errors D [m] of the points along their normals, one column for each independent cause."""
         return correlated_errors(self.points, self.shared, self.asymmetry)
 
 
 def correlated_errors(
     points: Float[Tensor, "m 3"], shared: Float[Tensor, "m c"], local: Float[Tensor, "m"] | float
 ) -> Float[Tensor, "m k"]:
-    """Return the error columns [m] of independent causes: the shared errors, and a smooth field of their deviation."""
+    """Return errors [m] of points, one column per independent cause: the shared errors, then a smooth random field.
+
+    At each point, the field has the standard deviation of the `local` and the `shared` errors together.
+    """
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
     alike = torch.exp(-0.5 * (torch.cdist(points, points) / PART) ** 2)
     return torch.cat([shared, deviation[:, None] * symmetric_root(alike, 1.0, "keep hidden points apart")], 1)
@@ -89,7 +92,7 @@ def correlated_errors(
 
 @checked
 def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count = 50) -> Completion:
-    """Return points of the hidden side, from the cloud's symmetry, with their uncertainty.
+    """Return at most `budget` points of the hidden side, from the cloud's symmetry, with their uncertainty.
 
     The cloud is mirrored across its best planes and across pairs of them; images in better planes come first. A body of
     revolution and a part attached to it, such as a handle, are mirrored separately, in the frame of the axis.
@@ -134,7 +137,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
 
 
 class _Part(NamedTuple):
-    """A part of the cloud, with its own mirror planes and their scores."""
+    """A part of the cloud, the points with the indices `rows`, with its own mirror planes and their scores."""
 
     scorer: SymmetryScorer
     rows: Tensor
@@ -144,7 +147,7 @@ class _Part(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Image(Batch):
-    """The mirror image of a part [m], with its score and errors; the score is infinite for the part itself.
+    """The mirrored points [m] of a part, with score and errors; an unmirrored part has infinite score.
 
     `variance` [m^2] is due to asymmetry. `shared` [m] is the shift of each point when the mirror is replaced by a
     nearby plane, weighted by the root of the plane's probability.
@@ -158,13 +161,13 @@ class _Image(Batch):
 
     @classmethod
     def of(cls, scorer: SymmetryScorer, points: Tensor, normals: Tensor, n_planes: int) -> "_Image":
-        """Return points as an image without errors."""
+        """Return unmirrored points as an image of infinite score, without errors."""
         shared = points.new_zeros(len(points), n_planes, NEARBY ** (2 if scorer.upright else 3))
         return cls(points, normals, math.inf, torch.zeros_like(points[:, 0]), shared)
 
 
 def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]:
-    """Split the cloud into parts: a body of revolution and what is attached to it, or the whole cloud."""
+    """Split the cloud into a body of revolution and an attached part, such as a handle, or return the whole cloud."""
     every = torch.arange(len(scorer.points))
     if revolution is None:
         return [_Part(scorer, every, *find_planes(scorer))]
@@ -196,7 +199,7 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
 
 
 def _mirror_in(scorer: SymmetryScorer, number: int, plane: Mirror, score: float) -> Callable[[_Image], _Image]:
-    """Return the function that mirrors points, or another image, in a plane; planes near it give the errors."""
+    """Return the function that mirrors an image in the plane of index `number`; nearby planes give its errors."""
     steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype)
     near = planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps)
     weight = torch.softmax(scorer.score(near)[0] / TEMPERATURE, 0)
@@ -218,7 +221,10 @@ def merge_hidden(
     allowed: Callable[[SomeHidden], Bool[Tensor, "n"]],
     thin: Callable[[Float[Tensor, "n 3"]], Int[Tensor, "k"]],
 ) -> SomeHidden:
-    """Add to `merged` the allowed points of each part that are `SPACING` apart from earlier parts, thinned."""
+    """Add to `merged` the points of each part that are `allowed` and farther than `SPACING` [m] from earlier points.
+
+    `thin` selects the points of a part to keep: it returns their indices.
+    """
     from scipy.spatial import KDTree
 
     for part in parts:
@@ -231,7 +237,7 @@ def merge_hidden(
 
 
 def _hidden(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return which points are far from the cloud, hidden in every view, and not below the table."""
+    """Return which points are away from the cloud, hidden in every view, and not below the table."""
     hidden = (scorer.nearest(points)[0] > NEW) & scorer.outline.hides(points)
     return hidden if scorer.table is None else hidden & (scorer.table.height(points) > -FRONT_MARGIN)
 

@@ -67,7 +67,10 @@ def find_ellipsoid(points: Points, normals: Points, outline: Outlines, table: fl
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """The least-squares fit of an ellipsoid, by its centre [m] and the logarithm of its root matrix (6 entries)."""
+    """The least-squares fit of an ellipsoid with 9 parameters.
+
+    They are its centre [m], and 6 entries of the logarithm of the symmetric matrix that maps the unit ball to it.
+    """
 
     points: np.ndarray
     normals: np.ndarray
@@ -75,7 +78,7 @@ class _Fit:
     table: float | None
 
     def solve(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the parameters and their covariance."""
+        """Return the 9 fitted parameters and their covariance matrix."""
         from scipy.optimize import least_squares
 
         rows = np.concatenate([2 * self.points, np.ones_like(self.points[:, :1])], 1)
@@ -96,7 +99,7 @@ class _Fit:
         return ((found[1:] - found[0]) / step[:, None]).T
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the residuals of points, normals, outline, table and prior over their deviations, for k ellipsoids."""
+        """Return residuals of points, normals, outline, table and prior over their deviations, a row per ellipsoid."""
         distance, normal = self.distance_and_normal(parameters)
         share, k = np.sqrt(len(self.points) / INDEPENDENT), len(parameters)
         shape = _symmetric(parameters[:, 3:])
@@ -131,7 +134,7 @@ def _length(vectors: np.ndarray) -> np.ndarray:
 
 
 def _support(parameters: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return how far [m] k ellipsoids extend along unit vectors."""
+    """Return how far [m] k ellipsoids extend from the origin along m unit vectors, as (k, m)."""
     reach = across @ _exponential(parameters[:, 3:])
     return parameters[:, :3] @ across.T + _length(reach)[..., 0]
 

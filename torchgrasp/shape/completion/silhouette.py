@@ -67,7 +67,7 @@ class Silhouette(Value):
         return dataclasses.replace(self, viewpoint=viewpoint, axes=axes, rim=rim, rim_normals=rim_normals)
 
     def _look_up(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the distance to the outline, the visible depth and the own depth at each point."""
+        """Return the distance to the outline at depth 1, the visible depth [m], and the point's own depth [m]."""
         local = (points - self.viewpoint) @ self.axes.T
         depth = local[..., 2].clamp_min(1e-9)  # behind the camera is far outside
         position = (local[..., :2] / depth[..., None] - self.corner) / self.cell
@@ -80,7 +80,7 @@ class Silhouette(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Outlines(Value):
-    """The silhouettes of all views of one object; the object satisfies the bounds of every view."""
+    """The silhouettes of all views of one object; the object lies within the outline of every view."""
 
     views: tuple[Silhouette, ...]
 
@@ -116,11 +116,11 @@ class Outlines(Value):
 
     @checked(gradients=True)
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the greatest violation [m] of any view by each point."""
+        """Return how far [m] points are outside an outline or in front of a visible surface, at most over views."""
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
     def hides(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-        """Return which points no view excludes: they may lie 1 mm outside the hull."""
+        """Return a mask of the points that may be on the hidden side: no view excludes them by more than 1 or 2 mm."""
         return (self.hull_distance(points) < 0.001) & (self.violation(points) < FRONT_MARGIN)
 
 
@@ -141,7 +141,7 @@ def silhouettes(cloud: PointCloud) -> Outlines:
 
 
 def silhouette(view: PointCloud) -> Silhouette:
-    """Return the silhouette of one view; all points lie in front of the camera.
+    """Return the silhouette of one view, whose points must all lie in front of the camera.
 
     A gap within the outline does not count as free space, because a mirror-like patch is not measured either.
     """
@@ -184,7 +184,7 @@ def silhouette(view: PointCloud) -> Silhouette:
 def _beyond_image(
     frustum: Tensor | None, axes: np.ndarray, corner: np.ndarray, cell: float, mask: np.ndarray, margin: float
 ) -> np.ndarray:
-    """Return which cells lie beyond an image border that the mask reaches, or within `margin` of this border."""
+    """Return which cells lie beyond an image border that the mask of the object reaches, or within `margin` of it."""
     beyond = np.zeros(mask.shape, dtype=bool)
     if frustum is None:
         return beyond
@@ -220,7 +220,7 @@ def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> 
 def _project(
     points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Return the axes of a camera that faces the points, and the points' pixels and depths [m]."""
+    """Return the axes of a camera that faces the points, and the points' image positions at depth 1 and depths [m]."""
     points, viewpoint = points.double().cpu(), viewpoint.double().cpu()
     forward = unit((points.amax(0) + points.amin(0)) / 2 - viewpoint)
     axes = torch.stack([*across(forward), forward])  # right, down, forward

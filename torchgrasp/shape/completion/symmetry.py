@@ -96,7 +96,7 @@ class SymmetryScorer:
         return float((self.points.amax(0) - self.points.amin(0)).max())
 
     def nearest(self, points: Tensor, limit: float = math.inf) -> tuple[Tensor, Tensor]:
-        """Return distance [m] and index of the nearest cloud point; infinity and 0 beyond the limit."""
+        """Return distance [m] and index of the nearest cloud point; infinity and 0 if none is within the limit."""
         distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)
         shape = points.shape[:-1]
         index = torch.from_numpy(np.where(np.isinf(distance), 0, index)).reshape(shape)
@@ -165,9 +165,9 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, 
 def find_plane_through_axis(
     scorer: SymmetryScorer, center: Float[Tensor, "2"], part: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
-    """Return the mirror plane through the vertical axis at `center` of an attached part, and its score.
+    """Return the mirror plane of an attached part, such as a handle, through the axis at `center`, and its score.
 
-    The plane with the least extent of the part across it is preferred, even if half of the part is hidden.
+    A plane across which the part extends less is preferred, even if half of the part is hidden.
     """
     normals = _level_directions(96)
     planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
@@ -181,7 +181,7 @@ def find_plane_through_axis(
 def planes_near(
     scorer: SymmetryScorer, plane: Mirror, angles: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
 ) -> Mirrors:
-    """Return planes near a plane: rotated by `angles` [rad] and shifted [m]; if `upright`, rotated about z only."""
+    """Return planes near a plane: rotated by `angles` [rad], if upright about z only, and shifted by `shifts` [m]."""
     normal = plane[:3]
     if scorer.upright:
         sideways = torch.stack([-normal[1], normal[0], torch.zeros_like(normal[0])])[None]
@@ -201,7 +201,7 @@ def _level_directions(n: int) -> Float[Tensor, "n 3"]:
 
 
 def _plane_grid(scorer: SymmetryScorer, directions: Directions, count: int = OFFSETS) -> Float[Tensor, "d k 4"]:
-    """Return planes with the given normals, at offsets over the cloud's extent."""
+    """Return planes with the given normals, each at `count` offsets over the cloud's extent."""
     along = scorer.points @ directions.T
     low, high = along.amin(0), along.amax(0)
     middle, half = (low + high) / 2, ((high - low) / 2).clamp_min(0.15 * scorer.size)
@@ -210,7 +210,7 @@ def _plane_grid(scorer: SymmetryScorer, directions: Directions, count: int = OFF
 
 
 def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: View) -> list[tuple[int, int]]:
-    """Return the grid indices of the best planes that hide points from the view and differ enough in direction."""
+    """Return grid indices of the best planes that differ in direction and can mirror points to where none are seen."""
     best, offset = scores.max(1)
     hides = _hides(directions, across)
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if hides[i]]
@@ -224,18 +224,18 @@ def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: V
 
 
 def _hides(directions: Directions, across: View) -> Bool[Tensor, "d"]:
-    """Return which planes, given by their normals, can have hidden mirror images; all, if `across` is None."""
+    """Return which planes, given by normals, can have hidden mirror images in the view `across`; all if it is None."""
     return torch.ones(len(directions), dtype=torch.bool) if across is None else (directions @ across).abs() > MIN_FACING
 
 
 def _without_slope(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror) -> list[Mirror]:
-    """Remove planes that score well only because they are near the best plane."""
+    """Return the planes without those that score well only because they are near the best plane."""
     least = float(scorer.score(best[None])[0]) - SLOPE
     return [p for p in planes if abs(float(p[:3] @ best[:3])) < APART or float(scorer.score(p[None])[0]) > least]
 
 
 def _across_plane(scorer: SymmetryScorer, planes: list[Mirror], grid: Float[Tensor, "d k 4"], across: View) -> Mirrors:
-    """Return the best plane that faces the view, if `planes` has no such plane; none if all violate free space."""
+    """Return, as a row, the best plane that faces the view; no row if `planes` has one or all violate free space."""
     if across is None or any(abs(float(plane[:3] @ across)) > FACING for plane in planes):
         return grid.new_zeros(0, 4)
     found = _best_plane(scorer, grid[(grid[:, 0, :3] @ across).abs() > FACING].reshape(-1, 4), -math.inf)
@@ -243,7 +243,7 @@ def _across_plane(scorer: SymmetryScorer, planes: list[Mirror], grid: Float[Tens
 
 
 def _square_plane(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror, across: View) -> Mirrors:
-    """Return the best vertical plane perpendicular to another, if it can add hidden points and no plane is near it."""
+    """Return, as a row, the best vertical plane perpendicular to `best` if it can hide images and no plane is near."""
     direction = torch.stack([-best[1], best[0], torch.zeros_like(best[0])])[None]
     near = any(abs(float(plane[:3] @ direction[0])) > 0.42 for plane in planes)
     if near or not bool(_hides(direction, across)):
@@ -252,7 +252,7 @@ def _square_plane(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror, ac
 
 
 def _best_plane(scorer: SymmetryScorer, planes: Mirrors, least: float) -> Mirrors:
-    """Return the plane of the greatest score above `least` that does not violate free space; or none."""
+    """Return, as a row, the plane of the greatest score above `least` that does not violate free space, or no row."""
     if not len(planes):
         return planes
     scores, violation = scorer.score(planes)
@@ -261,7 +261,7 @@ def _best_plane(scorer: SymmetryScorer, planes: Mirrors, least: float) -> Mirror
 
 
 def _refine(scorer: SymmetryScorer, plane: Mirror) -> Mirror:
-    """Return the plane after three grid searches, each half as wide as the last."""
+    """Return the plane of the best score nearby, after three grid searches, each half as wide as the last."""
     steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype)
     for width in (1.0, 0.5, 0.25):
         near = planes_near(scorer, plane, 0.06 * width * steps, 0.04 * scorer.size * width * steps)

@@ -95,7 +95,8 @@ def find_vessel(points: Points, normals: Points) -> Vessel | None:
 class HiddenWall(Batch):
     """Estimated points of a wall that the camera did not see [m], with outward normals.
 
-    The columns of `shared` are errors [m] for one standard deviation of axis position (two), thickness and floor.
+    The columns of `shared` are errors along the normals [m] for one standard deviation of the axis position (two
+    columns), the wall's thickness and the floor's height.
     """
 
     points: Float[Tensor, "m 3"]
@@ -114,8 +115,8 @@ class Wall(Value):
 def complete_walls(cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float) -> tuple[Wall, Wall]:
     """Return the outer and the inner wall of a vessel on a table of height `table` [m].
 
-    The other side of a seen wall is one thickness away. Parts that were seen on neither side come from rotation about
-    the axis.
+    The other side of a seen wall is one thickness away. Parts seen on neither side are estimated by rotating the seen
+    parts about the axis.
     """
     points, normals = cloud.points, cloud.normals
     assert normals is not None
@@ -135,12 +136,12 @@ def complete_walls(cloud: PointCloud, vessel: Vessel, outline: Outlines, table: 
 
 
 def lid(vessel: Vessel) -> HiddenWall:
-    """Return points of the flat lid that closes the outer body at the rim."""
+    """Return points of an imagined flat lid that closes the outer surface at the rim."""
     return _disc(vessel, vessel.rim, vessel.radius, ((0.0, 1), (0.5, 6)))
 
 
 def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
-    """Return the opposite side of a wall, one thickness away."""
+    """Return the points on the opposite side of a wall, one thickness away."""
     shared = wall.shared.clone()
     shared[:, 2] += THICKNESS_ERROR
     return HiddenWall(wall.points - vessel.thickness * wall.normals, -wall.normals, shared)
@@ -160,7 +161,7 @@ def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
 
 
 def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float, int], ...]) -> HiddenWall:
-    """Return horizontal points with normals up on rings about the axis; `rings`: relative radius, number of points."""
+    """Return points at one height, normals up, on rings about the axis; ring: (share of `radius`, number of points)."""
     places = []
     for share, count in rings:
         angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
