@@ -1,4 +1,4 @@
-"""The convex parts of a connected surface: it is cut along creases, where two surfaces meet at a concave angle."""
+"""Division of a connected surface into parts along its creases, where two surfaces meet at a concave angle."""
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h
 
 
 def _divide(points: np.ndarray, mask: np.ndarray, reach: float, least: float) -> np.ndarray:
-    """Return the parts 1, 2, ... of a piece between its creases; other pixels of it go to the nearest part."""
+    """Return the part (1, 2, ...) of each pixel of a piece, 0 outside it; pixels on creases join the nearest part."""
     from scipy.ndimage import binary_erosion, distance_transform_edt, label, uniform_filter
 
     step = max(2, round(reach))
@@ -71,7 +71,7 @@ def _divide(points: np.ndarray, mask: np.ndarray, reach: float, least: float) ->
 
 
 def _normals(points: np.ndarray, mask: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normals towards the camera at (0, 0, 0), and where the pixels about a pixel give one."""
+    """Return each pixel's unit normal towards the camera at (0, 0, 0), and a mask of the pixels where it is known."""
     known, sides = mask.copy(), []
     for axis in (1, 0):
         sides.append(np.roll(points, -step, axis) - np.roll(points, step, axis))
@@ -82,7 +82,7 @@ def _normals(points: np.ndarray, mask: np.ndarray, step: int) -> tuple[np.ndarra
 
 
 def _join_parts(parts: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return parts joined where the surfaces beside their border meet at no concave angle, numbered from 1."""
+    """Return each pixel's part after parts that do not meet at a concave angle are joined; numbers start from 1."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -95,7 +95,7 @@ def _join_parts(parts: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _borders(parts: np.ndarray) -> list[tuple[int, int]]:
-    """Return the pairs of parts with a common border of at least 5 pixels."""
+    """Return the pairs of numbers of parts that share a border of at least 5 pixels."""
     found = []
     for one, other in ((parts[1:], parts[:-1]), (parts[:, 1:], parts[:, :-1])):
         differ = (one != other) & (one > 0) & (other > 0)

@@ -1,4 +1,4 @@
-"""Scenes in files: a .npz with depth, labels, camera, supports and target."""
+"""Reading and writing of scenes as .npz files with depth, labels, camera, tables and target."""
 
 import dataclasses
 from pathlib import Path
@@ -16,15 +16,16 @@ from torchgrasp.scene.scene import Scene
 
 @checked
 def read_scene(path: Path | str) -> Scene:
-    """Read a scene from a .npz file, as `Scene.from_depth` does.
+    """Read a scene from the arrays in a .npz file, with the checks of `Scene.from_depth`.
 
-    It has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are `camera_pose` (4, 4), `labels`
-    or a `mask` of the target (h, w), the label `target`, `table` (4,): normal and offset, and `given`: the labels that
-    are the user's. Without it, labels are the user's, unless there is a table, as in scenes that the library saved.
+    The file has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are `camera_pose` (4, 4), the
+    objects' `labels` or the target's `mask` (h, w), the label `target`, the `table` (4,) as normal and offset, and
+    `given`, the labels that the user made. If `given` is missing, the user made all labels, unless there is a table, as
+    in scenes that the library saved.
 
     Raises:
         CloudFileError: no such file, or malformed content.
-        BadArgument: as `Scene.from_depth`.
+        BadArgument: see `Scene.from_depth`.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene

@@ -1,4 +1,4 @@
-"""What a pinhole depth camera measured: from arrays, files and clouds."""
+"""Depth images of a pinhole camera, made from arrays, files and point clouds."""
 
 import dataclasses
 import functools
@@ -32,7 +32,7 @@ LEAST_PIXELS = 30  # fewest pixels of an object: fewer do not show its shape
 class DepthImage(Value):
     """A pinhole camera's depth image: `depth` [m] along the optical axis, 0 where nothing was measured.
 
-    `intrinsics` [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] are pixels. `obj_from_camera` is the camera's pose.
+    `intrinsics` [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] are in pixels. `obj_from_camera` is the camera's pose.
     """
 
     depth: Float[Tensor, "h w"]
@@ -42,14 +42,14 @@ class DepthImage(Value):
 
     @property
     def frustum(self) -> Float[Tensor, "4 3"] | None:
-        """Inward normals of the sides of the camera's view, in the frame of `obj`, or None if it has no border."""
+        """Inward normals of the sides of the camera's view, in the frame `obj`; None if the image has no border."""
         if not self.bounded:
             return None
         return rotate(self.obj_from_camera.double(), frustum_of_image(self.intrinsics.double(), self.depth.shape))
 
     @checked
     def to_upright(self, obj_from_upright: Pose) -> "DepthImage":
-        """Return the image with its camera in an upright frame, rounded."""
+        """Return the image with the camera's pose given in an upright frame and rounded."""
         pose = inverse(obj_from_upright.double()).to(self.obj_from_camera.device) @ self.obj_from_camera.double()
         return dataclasses.replace(self, obj_from_camera=torch.round(pose / GRID**1.5) * GRID**1.5)
 
@@ -68,7 +68,7 @@ class DepthImage(Value):
         return self.bounded and int(reaching.sum()) >= 5  # fewer are noise
 
     def without_speckle(self) -> "DepthImage":
-        """Return the image with the median of the measured pixels of each 3 x 3 square where most are measured."""
+        """Return the image in which each depth is the median of the measured depths in its 3 x 3 square of pixels."""
         depth = self.depth.numpy()
         padded = np.pad(np.where(depth > 0, depth, np.nan), 1, constant_values=np.nan)
         squares = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*depth.shape, 9)
@@ -85,7 +85,7 @@ def read_image(
     camera_pose: Tensor | np.ndarray | None,
     depth_unit: float | None = None,
 ) -> DepthImage:
-    """Return a checked depth image in float64 [m]; a missing pose is the camera's own frame."""
+    """Return a checked depth image in float64 [m]; without a camera pose, its frame is the camera's own."""
     z, k, _ = read_depth(depth, intrinsics, depth_unit=depth_unit)
     pose = torch.eye(4, dtype=torch.float64) if camera_pose is None else read_camera_pose(camera_pose).cpu()
     if int((z > 0).sum()) < LEAST_PIXELS:
@@ -94,7 +94,7 @@ def read_image(
 
 
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
-    """Return the root mean square distance [m] of each label's points from their middle."""
+    """Return, for each label, the root mean square distance [m] of the label's points from their mean."""
     label, own = labels.reshape(-1), points.reshape(-1, 3)
     count = torch.bincount(label).clamp_min(1)
     mean = torch.stack([torch.bincount(label, weights=x) / count for x in own.unbind(-1)], -1)
@@ -106,7 +106,7 @@ def image_of_cloud(
 ) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
     """Return the depth image that a pinhole camera at the viewpoint takes of a cloud, and each point's row and column.
 
-    The camera looks at the middle of the points, upright. A pixel holds about two points and the nearest depth.
+    The upright camera looks at the middle of the points. A pixel covers about two points, and has the nearer depth.
     """
     forward = unit(unit(points - viewpoint).mean(0))
     down = -up + (up @ forward) * forward
@@ -138,7 +138,7 @@ def image_of_cloud(
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays of a scene's .npz file; table and others as floats, target, unit and `bounded` as numbers.
+    """Return the arrays in a scene's .npz file by name, converted to the types and shapes that a scene needs.
 
     Raises:
         CloudFileError: no such file, or malformed content.

@@ -23,10 +23,10 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
     """Return checked labels of the depth's or the cloud's shape: whole numbers >= 0, where 0 means no object.
 
     Args:
-        labels: numbers of the shape, of any type, or with one channel more; a picture (h, w, 3 or 4) with a colour for
-            each object, where black and transparent are none; a list of masks, where the smaller lies above the larger;
-            a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its "segmentation"; or a dict
-            with a list of "annotations".
+        labels: numbers of any type in the given shape, or with one more axis of length 1; a picture (h, w, 3 or 4) with
+            a colour for each object, where black and transparent mean no object; a list of masks, where a smaller mask
+            lies above a larger one; a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its
+            "segmentation"; or a dict with a list of "annotations".
         shape: shape of the depth (h, w), or of the cloud (n,).
         name: name of the argument, for errors.
 
@@ -70,7 +70,7 @@ def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..."]:
-    """Return the labels in an array or in run lengths."""
+    """Return the labels that an array of numbers, a picture of colours, or COCO's run lengths hold."""
     while isinstance(labels, Mapping) and "segmentation" in labels:
         labels = labels["segmentation"]
     if isinstance(labels, Mapping):
@@ -96,7 +96,7 @@ def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..
 
 
 def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
-    """Return the mask of one object, in any form of `read_labels`.
+    """Return the boolean mask of one object, given in any form that `read_labels` takes.
 
     Raises:
         BadArgument: as `read_labels`; no pixel inside; several objects.
@@ -111,7 +111,7 @@ def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
 
 
 def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Tensor, "h w"]:
-    """Return the mask of COCO's run lengths, column by column, as numbers or as text."""
+    """Return the mask that COCO's run lengths describe, column by column; the lengths are numbers or text."""
     allowed = f'a dict with "size" {list(shape)} and "counts", whose sum is {int(np.prod(shape))}'
     try:
         size, counts = [int(side) for side in mask["size"]], mask["counts"]
@@ -127,7 +127,7 @@ def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Te
 
 
 def _run_lengths(text: bytes) -> list[int]:
-    """Return the run lengths in COCO's text: 5 bits a letter, each after the third relative to the last but one."""
+    """Return the run lengths in COCO's text of 5 bits a letter; after the third, the text holds differences."""
     runs: list[int] = []
     value = shift = 0
     for letter in text:
@@ -146,10 +146,11 @@ def _run_lengths(text: bytes) -> list[int]:
 def label_image(
     image: DepthImage, support: Support, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
-    """Return the label of each pixel: the given ones without table and flying pixels, or those of `segment`.
+    """Return the label of each pixel, from the given labels, the given mask, or else from `segment`; and notes.
 
-    A mask becomes label 1. It loses the table and strips of neighbours. Other parts of its object just outside of it
-    belong to nothing. Also return a note for each mask that loses a twentieth or more.
+    Given labels lose pixels on the table and flying pixels. A mask becomes label 1, and loses strips of neighbouring
+    objects, too. Pixels of the mask's object just outside of the mask get label 0. A note tells of each mask that loses
+    a twentieth of its pixels or more.
 
     Raises:
         BadArgument: nothing but the table is left of a mask, or nothing of all labels.
@@ -190,10 +191,11 @@ def label_image(
 def label_again(
     image: DepthImage, former: Plane, support: Support, labels: Int[Tensor, "h w"], given: tuple[int, ...], first: int
 ) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel on another support than the former table.
+    """Return the label of each pixel after another support has replaced the former table.
 
-    Labels that the user gave lose pixels on the support, and get those of their objects that the former table hid.
-    Other objects are found again: an object has the label of most of its former pixels, the label `first` first.
+    Labels that the user gave lose pixels on the support, and gain pixels of their objects that the former table hid.
+    Other objects are segmented again, and each keeps the label of most of its former pixels. The label `first` is
+    assigned before the others.
     """
     own = torch.isin(labels, torch.tensor(given, dtype=torch.long))
     kept = torch.where(own & on_surface(image, support.plane), labels, 0)
@@ -217,7 +219,7 @@ def label_again(
 
 
 def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> Int[Tensor, "h w"]:
-    """Return the objects without the target, and without strips about its mask of objects that belong to it."""
+    """Return the labels of the other objects; the target, and strips of its own object around its mask, become 0."""
     from scipy.ndimage import binary_dilation
 
     about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
@@ -227,10 +229,10 @@ def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> I
 
 
 def _on_support(image: DepthImage, support: Support) -> Bool[Tensor, "h w"]:
-    """Return which pixels lie on the support or below it; others that a mask loses fly at a rim."""
+    """Return a mask of the pixels on the support or below it; other pixels that a mask loses are flying pixels."""
     return (image.depth > 0) & (support.plane.height(image.points()) < 0.01)
 
 
 def _removed(mask: str, count: int, seen: int, where: str = "the support") -> list[str]:
-    """Return a note on pixels that a mask loses, if they are many."""
+    """Return a list with a note on the pixels that were removed from a mask; it is empty if they are few."""
     return [f"{mask}: {count} of {seen} pixels lie on {where} and were removed"] if count > 0.05 * seen else []

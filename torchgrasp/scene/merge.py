@@ -1,7 +1,8 @@
-"""The pieces of a depth image that are one object.
+"""Merging of the pieces of a depth image that belong to one object.
 
-Pieces of one object meet at two ends, as a handle and its cup do; are over each other's footprint; make the rim of one
-hollow body; float beside it; or touch, unless each of them stands on the table or one lies upon the other.
+Two pieces belong to one object if they meet at two ends, as a handle and its cup do; if one is over the footprint of
+the other; if they form the rim of a hollow body; or if one floats beside the other. Touching pieces also belong to one
+object, unless both stand on the table or one lies upon the other.
 """
 
 import itertools
@@ -25,7 +26,7 @@ NESTED = 0.4  # a body with this share of its points over the footprint of a lar
 
 
 def merge_pieces(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
-    """Return the number of the object of each piece, 0 for the piece 0 and for pieces of no object."""
+    """Return, for each piece number, the number of the piece's object; 0 for number 0 and for pieces of no object."""
     from scipy.spatial import KDTree
 
     new, whole = torch.zeros(int(pieces.max()) + 1, dtype=torch.long), torch.bincount(pieces.reshape(-1))
@@ -48,7 +49,7 @@ def merge_pieces(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, ju
 
 
 def _thinned(image: DepthImage, pieces: Int[Tensor, "h w"], count: Int[Tensor, "k"]) -> Int[Tensor, "h w"]:
-    """Return the pieces at pixels 1.5 mm apart; pieces of fewer than 3000 pixels keep all of them."""
+    """Return the piece numbers at pixels 1.5 mm apart, 0 between them; small pieces keep their number everywhere."""
     away = float(image.depth[pieces > 0].median()) if bool((pieces > 0).any()) else 1.0
     step = max(1, int(0.0015 * float(image.intrinsics[0, 0]) / away))
     kept = (count < 3000)[pieces]
@@ -57,7 +58,7 @@ def _thinned(image: DepthImage, pieces: Int[Tensor, "h w"], count: Int[Tensor, "
 
 
 def find_touching(image: DepthImage, labels: Int[Tensor, "h w"]) -> list[tuple[int, int]]:
-    """Return the pairs of objects that touch, so that the border between them is a guess."""
+    """Return the pairs of labels of objects that touch, so that the border between the objects is a guess."""
     from scipy.spatial import KDTree
 
     names, points = labels[labels > 0].unique().tolist(), image.points()
@@ -67,7 +68,7 @@ def find_touching(image: DepthImage, labels: Int[Tensor, "h w"]) -> list[tuple[i
 
 
 def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> list["_Body"]:
-    """Return the bodies after joining those that are parts of one object, given the gaps [m] between pieces."""
+    """Return bodies, those of one object joined, given the gaps [m] between pieces and which pieces float."""
 
     def between(a: _Body, b: _Body) -> float:
         return float(gap[np.ix_(a.rows, b.rows)].min())
@@ -94,7 +95,7 @@ def _over_table(image: DepthImage, table: Plane) -> Float[Tensor, "h w 3"]:
 
 
 def _gaps(trees: list[Any]) -> np.ndarray:
-    """Return the distance [m] within which `TOUCH` points of one tree are near the other; infinity beyond `FAR`."""
+    """Return the gaps [m] between each two point sets (KD-trees): 0 if they meet at two ends, infinite beyond `FAR`."""
     low, high = np.stack([tree.mins for tree in trees]), np.stack([tree.maxes for tree in trees])
     gap = np.full((len(trees), len(trees)), np.inf)
     for a, b in itertools.combinations(range(len(trees)), 2):
@@ -138,7 +139,7 @@ class _Body:
 
 
 def _one_body(a: _Body, b: _Body, gap: float) -> bool:
-    """Return whether two bodies touch, one is over the footprint of the other, or both are parts of one rim."""
+    """Return whether two bodies are one object: they touch, one is over the other's footprint, or both form a rim."""
     if gap == 0.0 or gap > FAR:
         return gap == 0.0
     small, large = (a, b) if a.count < b.count else (b, a)
@@ -165,7 +166,7 @@ def _apart(small: _Body, large: _Body, over: float) -> bool:
 
 
 def _floating(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
-    """Return which pieces float: the table is seen below most of their lower edge, and that edge is high."""
+    """Return a mask of the pieces that float: the table is seen below most of their lower edge, which is high."""
     floating = torch.zeros(int(pieces.max()) + 1, dtype=torch.bool)
     down = -rotate(inverse(image.obj_from_camera), table.normal.double()[None])[0, :2]
     if float(torch.linalg.vector_norm(down)) < 0.2:  # seen from above, no edge is the lower one

@@ -1,7 +1,7 @@
-"""What may be in the way: the probability that each place around the target is full of something else.
+"""Estimation of obstacles: the probability that each place around the target is full of something else.
 
-Space in front of a measured depth is free. Behind an object's surface, the probability follows from its visible size
-and from the depth below it. `scripts/train.py occupancy` fits the model.
+Space in front of a measured depth is free. Behind an object's visible surface, a model estimates the probability from
+the object's visible size and the place behind the surface. `scripts/train.py occupancy` fits the model.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ SIDEWAYS, ABOVE = 0.25, 0.04  # how far [m] voxels extend around the target's po
 NOISE = 0.004  # space this far [m] in front of a measured depth is free: three standard deviations of the noise
 LOW = 0.01  # height [m] above the table below which unlabelled pixels show the table
 MODEL = Path(__file__).with_name("occupancy.json")
-"""Knots and weights of the model of occupancy, and what they were fitted on."""
+"""File with the knots and weights of the occupancy model, and with the data to which they were fitted."""
 
 
 @checked
@@ -56,7 +56,7 @@ class Occupancy(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Shadows(Value):
-    """A depth image [m] with small gaps filled, and the object in whose shadow the space behind each pixel is.
+    """A depth image [m] with small gaps filled, and `owner`: the object that hides the space behind each pixel.
 
     `owner` is 0 for the table, -1 where nothing was measured, an object's label, or another negative number for each
     object without label. `points` [m] are NaN where nothing was measured.
@@ -68,7 +68,7 @@ class Shadows(Value):
     points: Float[Tensor, "h w 3"]
 
     def look(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Return how far [m] points are behind the measured depth, along the ray, and the owner of the shadow."""
+        """Return how far [m] each point lies behind the measured depth, along its ray, and the owner of its pixel."""
         camera = apply(inverse(self.image.obj_from_camera.double()), points.double())
         x, y, z = camera.unbind(-1)
         (fx, _, cx), (_, fy, cy), _ = self.image.intrinsics.tolist()
@@ -84,7 +84,7 @@ class Shadows(Value):
 
 
 def cast_shadows(scene: Scene, target: int) -> Shadows:
-    """Return the shadows of a scene in the upright frame."""
+    """Return which object hides the space behind each pixel; the scene is in the upright frame of the target."""
     from scipy.ndimage import label
 
     image, (row, column) = scene.image, scene.pixels.unbind(-1)
@@ -108,7 +108,7 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
 
 
 def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Return distance [px] and flat index of the nearest of some pixels."""
+    """Return each pixel's distance [px] to the nearest pixel of a mask, and the flat index of that nearest pixel."""
     from scipy.ndimage import distance_transform_edt
 
     found: Any = distance_transform_edt(~pixels.numpy(), return_indices=True)
@@ -121,10 +121,10 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
 
     They are, in order:
 
-    * the depth behind its surface over its width,
-    * the depth [m] below its seen points in the same column,
-    * how deep [m] the mirrored point is behind the measured depth, for two guesses of the object's middle,
-    * the distance from its front over its seen depth, and from its middle over its width.
+    * the depth of the point behind the object's surface, over the object's width,
+    * the depth [m] of the point below the object's visible points in the same vertical column,
+    * how far [m] the mirrored point is behind the measured depth, for two guesses of the object's middle,
+    * the point's distance from the object's front, over the object's visible depth; from its middle, over its width.
     """
     from scipy.ndimage import maximum_filter
 
@@ -160,12 +160,12 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
 
 @functools.cache
 def load_model() -> dict[str, Any]:
-    """Return the knots and weights of each kind of hidden space."""
+    """Return the model's knots and weights for each kind of space: behind the target or an object, or unseen."""
     return json.loads(MODEL.read_text("utf-8"))
 
 
 def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
-    """Return the probability that places of a kind are full; the log-odds are a sum of piecewise linear functions."""
+    """Return the probability that places of a kind are full; log-odds add a piecewise linear function per feature."""
     model, odds = load_model()[kind], torch.full_like(features[:, 0], load_model()[kind]["bias"])
     for x, knots, values in zip(features.unbind(-1), model["knots"], model["values"], strict=True):
         odds += torch.from_numpy(np.interp(x.numpy(), knots, values)).to(odds)
@@ -174,10 +174,10 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
 
 @checked
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
-    """Return how likely places around the target are full of something else; the scene is in its upright frame.
+    """Return the probability that each voxel around the target is full of something other than target and table.
 
-    Space in front of a measured depth is free, and the table is no obstacle. In the shadow of an object the model gives
-    the probability. In the shadow of the target and outside the picture little is known. It is computed on the CPU.
+    The scene must be in its upright frame. Space in front of a measured depth is free. Behind an object, a model
+    estimates the probability. Little is known behind the target and outside the image. The computation is on the CPU.
 
     Raises:
         BadArgument: a target without points.

@@ -32,12 +32,12 @@ class Scene(Value):
     Args:
         points: every measured point [m].
         labels: 1, 2, ... for the objects, 0 for the table and everything else.
-        image: what the camera measured: it shows free space and hidden space.
+        image: the camera's depth image, which shows free space and hidden space.
         pixels: row and column of each point in the image.
         table: the plane that the objects stand on, or None if it is unknown.
         target: label of the object to be grasped, or None if none is chosen.
         others: other planes that objects could stand on, the more plausible first.
-        notes: what was removed of given masks or labels, a sentence each.
+        notes: a sentence for each given mask or label from which pixels were removed.
         given: labels whose pixels the user gave, as labels or as a mask; the library found the other objects.
 
     >>> from torchgrasp import load_scene
@@ -80,7 +80,7 @@ class Scene(Value):
             depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in millimetres.
             intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth` takes.
             camera_pose: obj_from_camera (4, 4), rigid; without it results are in the camera's frame.
-            mask: (h, w), not 0 at the target, which may be off by a few pixels; or in another form of `labels`.
+            mask: (h, w), not 0 at the target, with an outline within a few pixels; or in another form of `labels`.
             labels: (h, w) of whole numbers, where 0 means no object; a picture with a colour for each object; a list of
                 masks; or COCO's run lengths.
             point: a place on the target, as a pixel (u, v) or a point (x, y, z) [m].
@@ -210,7 +210,7 @@ class Scene(Value):
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Problems of the picture, a sentence each: several supports, objects that touch, a target that is cut off."""
+        """Problems of the scene, a sentence each: several supports, objects that touch, a target that is cut off."""
         found = [
             f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
             for plane in self.others
@@ -260,7 +260,7 @@ class Scene(Value):
 
     @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
-        """Return which points belong to an object, by default the target; none where there is no target."""
+        """Return a mask of the points of an object, by default the target; all are False if there is no target."""
         label = self.target if label is None else label
         return torch.zeros_like(self.labels, dtype=torch.bool) if label is None else self.labels == label
 
@@ -281,7 +281,7 @@ class Scene(Value):
 
     @checked
     def to_upright(self, obj_from_upright: Pose) -> "Scene":
-        """Return the scene in the `upright_frame` of its target and table, all rounded."""
+        """Return the scene in an upright frame, where the table is the plane z = 0; coordinates are rounded."""
         obj_from_upright = obj_from_upright.double()
         return dataclasses.replace(
             self,

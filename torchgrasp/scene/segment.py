@@ -1,4 +1,4 @@
-"""The objects in a depth image: what rises above the table, cut at jumps and creases, and merged to objects."""
+"""Segmentation of a depth image: pixels above the table are cut at jumps and creases, and merged to objects."""
 
 import numpy as np
 import torch
@@ -21,14 +21,14 @@ VAST = 0.2  # greatest root mean square distance [m] of an object's points from 
 
 
 def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel: 0 for the table, flying pixels and nothing; 1, 2, ... for objects by size.
+    """Return the label of each pixel: 1, 2, ... for objects, the largest first, and 0 for all other pixels.
 
     A piece is a connected component of the pixels above the table, without a jump of depth and without a crease. Pieces
     of one object are merged. Pixels at jumps go to the object whose surface they lie on, if there is one.
 
     Args:
         image: one view of the scene.
-        support: the plane that the objects stand on, in the frame of the image; what is beside its region is no object.
+        support: the plane that the objects stand on, in the frame of the image; pixels beside its region get 0.
     """
     table, points = support.plane, image.points()
     measured, smooth = image.depth > 0, image.without_speckle()
@@ -57,14 +57,14 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
 
 
 def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
-    """Return which pixels rise above the table and lie on a surface; flying pixels do not."""
+    """Return a mask of the pixels that rise above the table and lie on a surface; flying pixels are left out."""
     smooth = image.without_speckle()
     risen = _risen(smooth, table, *_smoothed(image, table))
     return _grown(image.points(), _core(smooth, risen)[0].long(), risen) > 0
 
 
 def _smoothed(image: DepthImage, table: Plane) -> tuple[Tensor, Tensor]:
-    """Return the mean height of the 5 x 5 pixels about each, and the least height of an object there."""
+    """Return the mean height [m] of the 5 x 5 pixels around each pixel, and the least height of an object there."""
     from scipy.ndimage import uniform_filter
 
     measured, height = image.depth > 0, table.height(image.points())
@@ -79,12 +79,12 @@ def _smoothed(image: DepthImage, table: Plane) -> tuple[Tensor, Tensor]:
 
 
 def _risen(smooth: DepthImage, table: Plane, mean: Tensor, threshold: Tensor) -> Bool[Tensor, "h w"]:
-    """Return which pixels rise above the table, with their neighbours and by themselves."""
+    """Return a mask of the pixels above the table: their own height and the mean around them exceed a threshold."""
     return (smooth.depth > 0) & (mean > threshold) & (table.height(smooth.points()) > 0.6 * threshold)
 
 
 def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the risen pixels away from jumps, and the difference of depth [m] that is a jump."""
+    """Return a mask of pixels above the table away from depth jumps, and each pixel's least size [m] of a jump."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     depth = smooth.depth
@@ -95,7 +95,7 @@ def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]:
-    """Return the number of the connected component of each core pixel, from 1; 0 elsewhere."""
+    """Return the number, from 1, of each pixel's connected component in the mask `core`; 0 outside of the mask."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -114,7 +114,7 @@ def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]
 
 
 def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
-    """Give risen pixels without a label, pass by pass, that of the nearest labelled point within `NEAR`."""
+    """Return labels in which pixels above the table without a label get that of the nearest point within `NEAR`."""
     from scipy.spatial import KDTree
 
     labels = torch.where((count_labels(labels) < FEW)[labels], 0, labels).reshape(-1)
@@ -131,7 +131,7 @@ def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
 
 
 def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h w"]:
-    """Give the floor within an object, such as a pan's, the object's label: it is enclosed and above the table."""
+    """Return labels in which a floor that an object encloses above the table, as in a pan, has the object's label."""
     from scipy.ndimage import binary_dilation, find_objects, label
 
     holes = np.empty(labels.shape, dtype=np.int32)
@@ -152,12 +152,12 @@ def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h 
 
 
 def count_labels(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
-    """Count the pixels of each label."""
+    """Return the number of pixels of each label 0, 1, ..., with at least `length` entries."""
     return torch.bincount(labels.reshape(-1), minlength=length)
 
 
 def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """Return labels 1, 2, ... by falling size, without specks of fewer than 100 pixels of 640 x 480."""
+    """Return labels renumbered 1, 2, ... from the largest object; specks (below 100 pixels of 640 x 480) become 0."""
     count = count_labels(labels)
     count[0] = 0
     order = torch.argsort(count, descending=True, stable=True)
@@ -174,7 +174,7 @@ def _is_noise(labels: Int[Tensor, "h w"], k: int, image: DepthImage, deviations:
         labels: labels of the objects.
         k: label of the small object.
         image: the depth image of the objects.
-        deviations: heights above the table over the deviation of the noise, with shape (h, w).
+        deviations: height of each pixel above the table, over the standard deviation of the noise, (h, w).
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt
 
