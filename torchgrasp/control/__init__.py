@@ -1,4 +1,4 @@
-"""The controller of a hand, real or simulated: grasp and sensor readings in, targets of joints and palm out."""
+"""The controller of a real or simulated hand: it turns a grasp and sensor readings into targets of joints and palm."""
 
 from torchgrasp.closure import ClosingGains, ClosingOptions
 from torchgrasp.control.controller import GraspController

@@ -1,4 +1,4 @@
-"""The grasp controller: guarded approach, closing of the fingers, and hold. It needs no simulator."""
+"""The grasp controller: approach that stops at a touch, closing of the fingers, and hold. It needs no simulator."""
 
 import functools
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.specs import ClosingMode, HoldingMode, check_modes
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
-"""Maps an observation and the time to the next tick [s] to the targets of all joints [rad]."""
+"""Function of an observation and the time [s] to the next tick, which returns the targets [rad] of all joints."""
 
 Closing = OpenLoopClosing | PositionClosing | PaperClosing | UncertaintyClosing
 Period = Annotated[float, Range(1e-5, 1.0)]
@@ -32,25 +32,26 @@ CLOSING_TIME = 4.0  # longest time [s] of closing before the hand presses with t
 
 
 class GraspController:
-    """Close a hand and hold the object: observations in, `Targets` out, all on the CPU.
+    """Close a hand and hold the object: each `step` takes an observation and returns `Targets`, all on the CPU.
 
     A closing controller brings the fingers to the object, then a hold controller presses. After `PRESSING_TIME` of
-    pressing `closed` is true: the hand may be lifted, while `step` is still called. If the plan knows the table and the
-    grasp seems too weak to lift, the hand opens instead, locates the object from its touches and closes again;
-    `attempts` counts the closings.
+    pressing, `closed` becomes true: the hand may be lifted, but `step` must still be called. If the plan includes the
+    table and the grasp seems too weak to lift the object, the hand opens, locates the object from its touches and
+    closes again; `attempts` counts the closings.
 
-    With `approach` > 0 the controller begins before the pre-grasp. While `approaching`, a robot arm must keep the
-    opened hand at the distance `Targets.left` from its pre-grasp; `stops` counts the stops at an unexpected touch.
+    With `approach` > 0 the opened hand starts away from its pre-grasp, the pose from which the fingers close. While
+    `approaching`, a robot arm must keep the hand at the distance `Targets.left` from the pre-grasp; `stops` counts the
+    stops at an unexpected touch.
 
     Args:
         reference: the closing plan.
-        closing, holding, options: as in `TrialSpec`.
+        closing, holding, options: modes of closing and holding, and options of the closing, as in `TrialSpec`.
         approach: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
 
     Raises:
-        BadArgument: unknown names; options or the holding "law" for a closing that has none; "impedance" for more than
-            three fingertips; modes that need more than the sensor measures; an approach without stops, or without a
-            table, a surface and tactile fingertips (`can_guard`).
+        BadArgument: unknown modes; options or the holding "law" for a closing mode that does not allow them;
+            "impedance" for more than three fingertips; modes that need more than the sensor measures; an approach
+            whose options allow no stops, or whose plan lacks a table, a surface or tactile fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.control import ClosingReference, no_contact, observe
@@ -98,7 +99,7 @@ class GraspController:
 
     @property
     def closed(self) -> bool:
-        """Whether the hand has closed and pressed: it may be lifted."""
+        """Whether the hand has closed and pressed long enough, so that it may be lifted."""
         if isinstance(self.closing, OpenLoopClosing):
             return self.closing.done
         return self.pressed >= PRESSING_TIME - 1e-9 and (self.check is None or self.check.secure)
@@ -110,7 +111,10 @@ class GraspController:
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """Lambda of each finger (Eq. 26) at the last tick; NaN before the first tick and without the control law."""
+        """Each finger's share of force control, from 0 to 1, at the last tick: lambda in Eq. (26) of the paper.
+
+        The shares are NaN before the first tick, and at ticks at which the control law does not command the fingers.
+        """
         acts = self.hold is None and self.reopening is None and self.time > 0.0
         if acts and isinstance(self.closing, PaperClosing | UncertaintyClosing):
             return self.closing.share
@@ -118,9 +122,9 @@ class GraspController:
 
     @checked
     def step(self, observation: Observation, period: Period) -> Targets:
-        """Return the targets of joints and palm for the next tick, a period [s] later.
+        """Return the targets of joints and palm for the next tick, which comes `period` [s] later.
 
-        In the tick in which the closing ends the targets do not change: that tick computes the hold's forces.
+        In the tick in which the closing ends, the targets do not change, because that tick computes the hold's forces.
 
         Raises:
             BadArgument: an observation of another hand, or on another device than the CPU; a period outside `Period`.
@@ -140,7 +144,7 @@ class GraspController:
         return self.targets
 
     def _approach(self, guard: GuardedApproach, observation: Observation, period: float) -> Targets:
-        """Return the targets of the approaching hand; at its end pass the object pose found by touch to the closing."""
+        """Return the targets during the approach; at its end, give the closing the object pose found by touch."""
         guard(observation, period)
         if guard.done:
             self.guard, self.stops = None, guard.stops
@@ -189,7 +193,7 @@ class GraspController:
 
 
 def make_closing(reference: ClosingReference, mode: ClosingMode, options: ClosingOptions) -> Closing:
-    """Return the closing controller of a closing mode."""
+    """Return the controller that closes the hand along the plan `reference`, for a closing mode such as "paper"."""
     match mode:
         case "open_loop":
             return OpenLoopClosing(reference)
@@ -208,7 +212,7 @@ def make_closing(reference: ClosingReference, mode: ClosingMode, options: Closin
 def choose_holding(
     hand: Hand, mode: HoldingMode
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
-    """Return the constructor of the hold controller of a mode, or None if the closing controller itself presses."""
+    """Return the constructor of a mode's hold controller, or None if the closing controller itself holds the object."""
     if mode == "impedance":
         hand.require_three("holding", "'impedance', whose virtual frame is of three,")
         return functools.partial(Impedance, stability=load_stability(hand))

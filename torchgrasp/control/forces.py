@@ -21,23 +21,24 @@ def desired_forces(
     strongest: float = 4.0,
     preferred: Float[Tensor, "*#b f"] | None = None,
 ) -> Float[Tensor, "*b f 3"]:
-    """Return balanced fingertip forces [N] on the object with the least friction (`least_friction_forces`).
+    """Return balanced fingertip forces [N] on the object that need the least friction (`least_friction_forces`).
 
-    Where no balanced forces press at every contact, each force has `strongest` [N] along the inward normal.
+    The largest normal force is `strongest` [N]; `preferred` are wanted ratios of the normal forces. Where no balanced
+    forces press at every contact, each force is `strongest` along the inward normal.
     """
     balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
 
 
 def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tensor, "g f 3"]]:
-    """Return the planned contact points [m] and normals of grasps in the hand's frame."""
+    """Return the planned contact points [m] and outward normals of grasps, in the hand's frame."""
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     contacts = grasps.contacts
     return apply(hand_from_obj, contacts.points.double()), rotate(hand_from_obj, contacts.normals.double())
 
 
 class Squeeze(NamedTuple):
-    """Joint targets [rad] that press on the object, the fingertip forces [N] and the joint torques [N m]."""
+    """Joint targets [rad] that press on the object in g grasps, the fingertip forces [N] and joint torques [N m]."""
 
     joints: Float[Tensor, "g h"]
     forces: Float[Tensor, "g f 3"]
@@ -74,7 +75,7 @@ def squeeze(
 
 
 def check_hand(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` for grasps of other fingers or joints than the hand's; grasps without finger names pass."""
+    """Raise `BadArgument` for grasps whose fingers or joints are not the hand's; grasps may lack finger names."""
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
     if tuple(names) != hand.finger_names or grasps.contacts.fingertips != len(names):
         found = f"{grasps.contacts.fingertips} contacts a row, of the fingers {', '.join(names)}"
@@ -90,19 +91,19 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return joint targets, forces and torques with which drives of a stiffness [N m/rad] exert given forces [N]."""
+    """Return the joint targets with which joint drives of a `stiffness` [N m/rad] exert given fingertip forces [N]."""
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
 
 
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
-    """Return the stiffness [N m/rad] of every joint of the URDF: `kp`, or the hand's own."""
+    """Return the drive stiffness [N m/rad] of every joint of the URDF: `kp` if given, else the hand's own."""
     kps = [hand.actuators[name].kp if kp is None else kp for name in hand.tree.joint_names]
     return torch.tensor(kps, dtype=torch.float64)
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint and the joints that are coupled to it; `kp` as above."""
+    """Return the stiffness [N m/rad] of each actuated joint with its coupled joints; `kp` replaces the hand's own."""
     coupling = hand.actuated.coupling
     return (coupling**2 * drive_stiffness(hand, kp).to(coupling)[:, None]).sum(0)
 
@@ -110,6 +111,6 @@ def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
 def tip_compliance(
     jacobian: Float[Tensor, "*b f 3 h"], normals: Float[Tensor, "*b f 3"], stiffness: Float[Tensor, "h"]
 ) -> Float[Tensor, "*b f"]:
-    """Return how far [m/N] each fingertip yields along its normal, given the joint stiffness [N m/rad]."""
+    """Return how far each fingertip yields along its normal per force [m/N], given the joint stiffness [N m/rad]."""
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

@@ -1,4 +1,4 @@
-"""Hold controllers: press with balanced forces at the contacts, or with the least forces that carry the felt load."""
+"""Hold controllers: press with balanced forces at the contacts, or with the least forces that carry the sensed load."""
 
 import math
 
@@ -26,7 +26,8 @@ LIFTED = 0.35  # load [N] from which the object counts as lifted
 class ForceHold:
     """Press with balanced forces at the sensed contacts; `start` holds the joint targets [rad] at the closing's end.
 
-    The joints stay compliant. One factor scales all forces: a force loop for each finger would push the object.
+    The joints stay compliant. Force feedback changes one common factor on all forces, because a separate force loop
+    for each finger would push the object away.
     """
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
@@ -39,7 +40,7 @@ class ForceHold:
         self.senses_force = reference.sensor.kind != "binary"
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick."""
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
         if share == 1.0 and self.senses_force:
@@ -54,20 +55,21 @@ class PositionHold:
         self.start = start
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick."""
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         return self.start
 
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
-    """Return the common force factor one tick later: an integral controller of the sum of normal forces [N]."""
+    """Return the common factor on all forces one tick later; it brings the sum of normal forces to `strength` [N]."""
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), MAX_FACTOR)
 
 
 def held_forces(reference: ClosingReference, observation: Observation) -> tuple[Float[Tensor, "f 3"], float]:
-    """Return balanced forces [N] at the sensed contacts, and the sum [N] of the normal forces of working sensors.
+    """Return balanced forces [N] on the object, and the sum [N] of their normal parts at tips with a working sensor.
 
-    If a finger does not touch, or no balanced forces press at every contact, the planned forces are returned.
+    The forces act at the sensed contacts. If a finger does not touch, or if no balanced forces press at every contact,
+    the planned forces are returned.
     """
     gains, normals = reference.gains, reference.normals
     forces = gains.desired_force
@@ -88,9 +90,9 @@ class FrictionEstimate:
         self.mean, self.std = 0.8, PRIOR_STD
 
     def update(self, ratio: float, force: float, lagging: bool = False) -> None:
-        """Update the estimate by the friction ratio and the normal force [N] of a fingertip that slides.
+        """Update the estimate by a sliding fingertip's ratio of tangential to normal force, and its normal force [N].
 
-        The ratio is less certain while it is `lagging`: the fingertip has just begun to slide.
+        The ratio is less certain while it is `lagging`, because the fingertip has just begun to slide.
         """
         noise = (1 + lagging) * 0.4 * math.hypot(1.0, ratio) / force
         weight = self.std**2 / (self.std**2 + noise**2)
@@ -99,19 +101,19 @@ class FrictionEstimate:
 
     @property
     def low(self) -> float:
-        """A lower bound: the mean less one standard deviation."""
+        """A lower bound of the friction coefficient: the mean less one standard deviation."""
         return max(self.mean - self.std, 0.15)
 
     @property
     def high(self) -> float:
-        """An upper bound: the mean plus one standard deviation."""
+        """An upper bound of the friction coefficient: the mean plus one standard deviation."""
         return self.mean + self.std
 
 
 class GripHold:
-    """Press with the least forces that carry the load which the fingertips feel, none above `reference.max_force`.
+    """Press with the least forces that carry the load felt by the fingertips; none exceeds `reference.max_force`.
 
-    `status` turns `TOO_HEAVY` when a fingertip slides at the limits of torque or force.
+    `status` becomes `TOO_HEAVY` when a fingertip slides although the torques or forces have reached their limits.
     """
 
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
@@ -136,11 +138,11 @@ class GripHold:
 
     @property
     def weight(self) -> float:
-        """The load [N] that the fingertips feel."""
+        """The size of the force [N] with which the object loads the fingertips, as they feel it."""
         return float(np.linalg.norm(self.load[:3]))
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick."""
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
         jacobian, fastest_rise = observation.jacobian.numpy(), 60.0  # [N/s]
         contacts = self._feel(observation, period)
@@ -156,13 +158,13 @@ class GripHold:
         return self.start + share * (self.rest + lead - self.start)
 
     def _floor(self) -> np.ndarray:
-        """Return the least allowed normal force [N] of each finger, below 80 % of the largest."""
+        """Return the least allowed normal force [N] of each finger; it leaves room below the largest allowed force."""
         floor = np.maximum(self.grip, self.least)
         largest = float((floor / self.planned).max() * self.planned.max())
         return floor * min(1.0, 0.8 * self.solver.most / largest)
 
     def _feel(self, observation: Observation, period: float) -> Balance:
-        """Filter the sensed forces, load and normals; return the grasp map of the contacts."""
+        """Filter the sensed forces, load and normals; return the contacts' grasp map with its pseudo-inverse."""
         normals = _sensed(observation, self.normals)
         self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
         self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
@@ -175,7 +177,7 @@ class GripHold:
         return contacts
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
-        """Return the part of a load wrench that weight can cause: upwards from a known table, arm at most 0.1 m."""
+        """Return the part of a load wrench that weight can cause: a force normal to the table, a limited torque."""
         if self.up is None:
             return load
         lifted = max(float(load[:3] @ self.up), 0.0)
@@ -205,7 +207,7 @@ class GripHold:
         self._release(bool((slides | creeps | ~pressing).any()), period)
 
     def _release(self, moving: bool, period: float) -> None:
-        """Reduce the forces once the lifted load has been steady, then assume a higher friction coefficient."""
+        """Reduce the forces once the lifted load is steady; when they are low, assume a higher friction coefficient."""
         if moving:
             self.optimism = 0.0
         if moving or self.weight > 1.05 * self.most:
@@ -223,7 +225,7 @@ class GripHold:
         return 3.0 * (self.weight + 0.5) / self.friction.low
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
-        """Choose the friction coefficient for the next solution; judge whether the load is too heavy."""
+        """Choose the friction coefficient for the forces of the next tick; judge whether the load is too heavy."""
         share, push = self.solver.share(self.normals, jacobian), -float((wanted * self.normals).sum())
         goal = min(self.friction.low + self.optimism, self.friction.high)
         if share > 1.0 or push > max(self._enough(), float(self.grip.sum())):
@@ -236,7 +238,7 @@ class GripHold:
             self.status = Status.TOO_HEAVY
 
     def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
-        """Return the forces that the drives exert: the wanted forces, with force feedback, less the carried load."""
+        """Return the forces [N] for the drives to exert: `wanted` with feedback, and with a load that grows slowly."""
         if self.time > RAMP:
             lacking = ((self.felt - wanted) * self.normals).sum(-1)
             self.trim = self.trim - period * 4.0 * lacking[:, None] * self.normals

@@ -1,4 +1,4 @@
-"""The closing control law (Eqs. 25-28): position control far from a contact, force control near it.
+"""The closing control law (Eqs. 25-28 of the paper): position control far from a contact, force control near it.
 
 The gains are inverse to the uncertainty of shape and force. All functions are pure and batched over leading axes.
 """
@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.geometry.linalg import cholesky, limit_norm, squared_mahalanobis
 
 POSITION_FLOOR = 0.005
-"""Isotropic standard deviation [m] of Sigma_cov: errors of hand pose and joint zeros; it keeps Eq. (27) finite."""
+"""Standard deviation [m], in all directions, of errors of hand pose and joint zeros; it keeps Eq. (27) finite."""
 
 POSITION_RATE = 4.0  # largest position gain [1/s]: alpha_p = POSITION_RATE * POSITION_FLOOR**2
 
@@ -24,15 +24,19 @@ MAX_STEP = 0.05  # largest change [rad] of a joint in one tick; it bounds steps 
 
 
 def surface_covariance(normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
-    """Return Sigma_cov of Eq. (27) [m^2]: the shape's variance along the normal plus an isotropic floor."""
+    """Return the covariance [m^2] of each contact's position (Sigma_cov, Eq. 27 of the paper).
+
+    It is the shape's variance `std_m`^2 along the normal, plus the variance of the hand, equal in all directions.
+    """
     return _normal_covariance(normals, std_m, POSITION_FLOOR)
 
 
 def force_covariance(
     forces: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], deviation: Float[Tensor, "*b"] | None = None
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return Sigma_fd of Eq. (28) [N^2]: the variance of the normal force along the normal, plus an isotropic floor.
+    """Return the covariance [N^2] of each contact force (Sigma_fd, Eq. 28 of the paper).
 
+    It is the variance of the normal force along the normal, plus the sensor's variance, equal in all directions.
     `deviation` [N] is the standard deviation of each normal force; by default a tenth of the force.
     """
     std = 0.1 * (forces * normals).sum(-1) if deviation is None else deviation
@@ -40,24 +44,27 @@ def force_covariance(
 
 
 def _normal_covariance(normals: Float[Tensor, "*b 3"], std: Float[Tensor, "*b"], floor: float) -> Tensor:
-    """Return covariances (3, 3) with standard deviation `std` along the normal, plus an isotropic `floor`."""
+    """Return covariances (3, 3): the variance `std`^2 along the normal, plus `floor`^2 in all directions."""
     along = normals[..., :, None] * normals[..., None, :] * std[..., None, None] ** 2
     return along + floor**2 * torch.eye(3, dtype=normals.dtype, device=normals.device)
 
 
 def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return lambda of Eq. (26): 1 at the contact, near 0 where the error [m] exceeds the shape's uncertainty."""
+    """Return each finger's share of force control, from 0 to 1 (lambda in Eq. 26 of the paper).
+
+    It is 1 at the contact, and near 0 where the position error [m] exceeds the shape's uncertainty.
+    """
     factor = cholesky(covariance, "the covariance of a contact", "add an isotropic floor")
     return torch.exp(-0.5 * squared_mahalanobis(error, factor))
 
 
 def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the diagonal of K_P [1/s] of Eq. (27): alpha_p [m^2/s] over the diagonal of Sigma_cov."""
+    """Return the position gain [1/s] on each axis (K_P, Eq. 27 of the paper): a constant over the axis's variance."""
     return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
 
 def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float) -> Float[Tensor, "*b 3"]:
-    """Return the diagonal of C_F [m/(s N)] of Eq. (28): alpha_f [m N/s] over the diagonal of Sigma_fd [N^2]."""
+    """Return the force gain [m/(s N)] on each axis (Eq. 28 of the paper): alpha_f [m N/s] over the axis's variance."""
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)
     return alpha_f[..., None] / diagonal if isinstance(alpha_f, Tensor) else alpha_f / diagonal
 
@@ -81,9 +88,10 @@ def tip_velocity(
     force_gain: Float[Tensor, "*b 3"],
     together: bool = False,
 ) -> Float[Tensor, "*b 3"]:
-    """Return the velocity [m/s] of each fingertip, the bracket of Eq. (25), limited to `MAX_SPEED`.
+    """Return the commanded velocity [m/s] of each fingertip, at most `MAX_SPEED`: the bracket in Eq. (25) of the paper.
 
-    `together` scales all fingers by one factor, so that the ratios of their speeds stay those of Eq. (25).
+    The share `blend` of the velocity is force control, the rest position control. With `together`, the limit scales
+    all fingers by one factor, which keeps the ratios of their speeds.
     """
     share = blend[..., None]
     velocity = (1 - share) * position_gain * position_error + share * force_gain * force_error
@@ -96,7 +104,7 @@ def tip_velocity(
 def stay_above(
     velocity: Float[Tensor, "*b 3"], height: Float[Tensor, "*b"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*b 3"]:
-    """Return fingertip velocities [m/s], slowed downwards so that tips at `height` [m] stay above the table."""
+    """Return fingertip velocities [m/s], slowed downwards so that tips at `height` [m] over the table stay above it."""
     lacking = -POSITION_RATE * height.clamp_min(0.0) - velocity @ up
     return velocity + lacking.clamp_min(0.0)[..., None] * up
 
@@ -108,10 +116,11 @@ def joint_step(
     posture_error: Float[Tensor, "*b h"] | None = None,
     damping: float = 1e-5,
 ) -> Float[Tensor, "*b h"]:
-    """Return the change of the joints [rad] in one tick, Eq. (25), by damped least squares over all fingers.
+    """Return the change of the joints [rad] in one tick, which moves the fingertips with the given velocities [m/s].
 
-    The paper's J^-1 does not exist for coupled fingers or few joints. In the null space of the Jacobian the joints move
-    towards the planned posture: `posture_error` [rad] is the planned minus the present joints.
+    Damped least squares over all fingers replace the inverse Jacobian in Eq. (25) of the paper, which coupled fingers
+    lack. Motions that leave the fingertips at rest bring the joints towards the planned posture: `posture_error` [rad]
+    is the planned minus the present joints.
     """
     stacked = jacobian.flatten(-3, -2)
     inverse_jacobian = damped_inverse(stacked, damping)

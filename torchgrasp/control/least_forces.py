@@ -1,6 +1,7 @@
-"""The least fingertip forces that carry a load, by a barrier method with a few Newton steps a tick.
+"""The least fingertip forces that carry a load, by a barrier method with a few Newton steps per tick.
 
-With normal forces n_i, tangential forces t_i and joint torques tau_j the method minimises
+For normal forces n_i above floor_i, tangential forces t_i, joint torques tau_j, friction coefficient mu and a small
+weight eps of the barrier, the method minimises
 
     sum n_i + PENALTY sum max(|tau_j| / effort_j - KNEE, 0)^2 - eps sum [log(mu^2 n_i^2 - |t_i|^2) + log(n_i - floor_i)]
 
@@ -19,11 +20,14 @@ from torchgrasp.plan.forces import grasp_map
 Array = np.ndarray
 
 PENALTY, KNEE = 500.0, 0.9
-"""Weight [N] of joint torques and normal forces near their limits, and the share of the limits where it begins."""
+"""Weight [N] of the penalty on joint torques and normal forces, and the share of their limits where it begins."""
 
 
 class Balance(NamedTuple):
-    """The grasp map of the contacts, its pseudo-inverse, and a basis of its null space: the k internal forces."""
+    """The grasp map of contacts, which gives the wrench of the n force components; its pseudo-inverse; its null space.
+
+    The columns of `free` are a basis of the null space: k internal forces, which exert no wrench.
+    """
 
     wrench: Float[Array, "6 n"]
     inverse: Float[Array, "n 6"]
@@ -40,17 +44,17 @@ def balance(points: Float[Array, "f 3"]) -> Balance:
 
 
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
-    """Return each finger's ratio of tangential to normal force; infinite where a finger does not press."""
+    """Return each finger's ratio of tangential to normal force; the ratio is infinite if the finger does not press."""
     push = -(forces * normals).sum(-1)
     slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
     return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
 
 
 class LeastForces:
-    """A solver for the least fingertip forces [N]; each call starts from the forces of the last call.
+    """A solver for the least fingertip forces [N] that carry a load; each call of `solve` starts from the last forces.
 
     The first call starts from the forces `start`, which press at every contact. `effort` [N m] limits the torque of
-    every joint, `most` [N] the normal force of a finger.
+    every joint, `most` [N] limits the normal force of every finger.
     """
 
     def __init__(self, start: Float[Array, "f 3"], effort: Float[Array, " j"], most: float) -> None:
@@ -65,9 +69,10 @@ class LeastForces:
         friction: float,
         floor: Float[Array, "f"],
     ) -> Float[Array, "f 3"]:
-        """Return forces [N] that carry the load, within the friction cones, with normal forces above `floor` [N].
+        """Return the least forces [N] that exert the wrench `load`, with normal forces above each finger's `floor` [N].
 
-        If no forces within the cones are found, the friction is raised to the least at which forces were found.
+        The forces are within the cones of the coefficient `friction`. If no such forces are found, the coefficient is
+        raised to the least with which forces were found.
         """
         count = len(normals)
         push = -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
@@ -91,13 +96,13 @@ class LeastForces:
         return self.forces
 
     def share(self, normals: Float[Array, "f 3"], jacobian: Float[Array, "f 3 j"]) -> float:
-        """Return the largest ratio of a joint torque or normal force to its limit."""
+        """Return the largest ratio of a joint torque or normal force to its limit, for the forces found last."""
         torque = np.abs(np.einsum("nij,ni->j", jacobian, self.forces)) / self.effort
         return max(float(torque.max()), float((-(self.forces * normals).sum(-1)).max()) / self.most)
 
 
 class _Barrier:
-    """The barrier objective, as a function of k coordinates z of the internal forces."""
+    """The objective that the solver minimises, as a function of the k coordinates z of the internal forces."""
 
     def __init__(
         self,
@@ -116,14 +121,14 @@ class _Barrier:
         self.push_0 = -(normals * self.carried.reshape(self.count, 3)).sum(-1)
 
     def place(self, forces: Float[Array, "f 3"], share: float = 1.0) -> Float[Array, " k"]:
-        """Return the coordinates z nearest to given forces, less a `share` of the load-carrying forces."""
+        """Return the coordinates z of given forces, after a `share` of the forces that carry the load is subtracted."""
         return self.basis.T @ (forces.ravel() - share * self.carried)
 
     def forces(self, z: Float[Array, "*g k"]) -> Float[Array, "*g f 3"]:
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
-        """Return the best of several initial guesses; if none is feasible, raise the friction and lower the floors."""
+        """Return the best of g initial coordinates z; if none is feasible, raise the friction and lower the floors."""
         push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
         across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
         ratio = np.where(push > 0, across / np.maximum(push, 1e-12), np.inf).max(-1)
@@ -135,7 +140,7 @@ class _Barrier:
         return tried[int((value if np.isfinite(value).any() else ratio).argmin())]
 
     def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
-        """Return the objective at coordinates z; infinite outside the friction cones."""
+        """Return the objective at each row of coordinates z; it is infinite outside the friction cones."""
         n, t = z @ self.push.T + self.push_0, z @ self.tau.T + self.tau_0
         cone = self.slack * n * n - (self.forces(z) ** 2).sum(-1)
         inside = ((cone > 0) & (n > self.floor)).all(-1)
@@ -145,7 +150,7 @@ class _Barrier:
         return np.where(inside, n.sum(-1) + over - self.gap * logs, np.inf)
 
     def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
-        """Return Newton's step at coordinates z, and the Newton decrement."""
+        """Return Newton's step at coordinates z, and the Newton decrement, which measures how far the optimum is."""
         gap, push = self.gap, self.push
         n, t, force = push @ z + self.push_0, self.tau @ z + self.tau_0, self.forces(z)
         cone = self.slack * n * n - (force * force).sum(-1)

@@ -1,4 +1,4 @@
-"""The object-pose estimate from touches: how far the object is displaced from its pose in the plan.
+"""Estimates of the object's pose from touches: how far the object is displaced from its pose in the plan.
 
 While the fingers close, `ContactPlanes` uses the tangent plane at each planned contact. While the hand stands still,
 `Localization` compares touched points and normals with the estimated surface, so that it also finds displacements along
@@ -23,9 +23,9 @@ PITCH = 0.004  # distance [m] between the displacements that `Localization` trie
 class ContactPlanes:
     """Estimate the object's displacement while the fingers close, from the tangent planes at its contacts.
 
-    A fingertip that touches measures the offset of its plane, with the variance of the shape (Sigma_cov). A fingertip
-    that is beyond its plane without a touch bounds the offset. The estimate maximises the posterior density under a
-    Gaussian prior with the mean `expected` [m, rad] (by default 0), in the frame of the hand at its planned pose.
+    A fingertip that touches measures how far its contact's plane has moved along the normal, with the variance of the
+    shape. A fingertip beyond its plane that touches nothing bounds this distance. The estimate is the most probable
+    displacement under a Gaussian prior with the mean `expected` [m, rad] (by default 0), in the planned hand's frame.
     """
 
     def __init__(self, reference: ClosingReference, expected: Float[Tensor, "6"] | None = None) -> None:
@@ -40,7 +40,7 @@ class ContactPlanes:
     def displacement(self, points: Float[Tensor, "f 3"], touching: Bool[Tensor, "f"]) -> Float[Tensor, "6"]:
         """Return the most probable displacement: translation of the contacts' centroid [m], rotation about it [rad].
 
-        `points` [m] are those of the fingertips that are ahead in the directions of their contacts.
+        `points` [m] are the points of the fingertips that would touch first; `touching` marks fingertips that touch.
         """
         off = ((points - self.target) * self.normals).sum(-1)
         beyond = (off - self.rows @ self.expected).clamp_min(-0.025)  # a finger farther on has missed the object
@@ -64,7 +64,7 @@ class ContactPlanes:
 
 
 def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
-    """Return the prior's inverse covariance: an object moves along its table and turns about the table's normal."""
+    """Return the prior's inverse covariance: the object moves mostly along the table and turns about its normal."""
     shift_std, height_std, turn_std, tilt_std = 0.01, 0.001, 0.09, 0.01  # [m, m, rad, rad]
     eye = torch.eye(3, dtype=reference.normals.dtype)
     place, turn = eye / shift_std**2, eye / turn_std**2
@@ -77,9 +77,9 @@ def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
 
 
 class Touches:
-    """Averages over time of the points and normals that a resting hand touches, in the frame of its planned pose.
+    """Time averages of the contact points and normals that a resting hand senses, in the frame of its planned pose.
 
-    `known` marks fingertips with a working sensor, `felt` fingertips that reported where they touch.
+    `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have reported where.
     """
 
     def __init__(self, reference: ClosingReference) -> None:
@@ -99,11 +99,11 @@ class Touches:
 
     @property
     def felt(self) -> Bool[Tensor, "f"]:
-        """Which fingertips still touch and have reported where."""
+        """Whether each fingertip still touches and has reported where."""
         return self.contact & (self.count > 0)
 
     def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """Return mean contact points [m] and normals; zero for fingertips that reported no contact."""
+        """Return mean contact points [m] and unit normals; both are zero for fingertips that reported no contact."""
         return self.points / self.count.clamp_min(1)[:, None], unit(self.normals)
 
 
@@ -130,11 +130,11 @@ class Localization:
 
     @property
     def displacement(self) -> Float[Tensor, "6"]:
-        """The best object displacement so far [m, rad]."""
+        """The best displacement of the object so far: translation [m] and rotation vector [rad]."""
         return torch.cat([self.shift @ self.axes, self.turn * self.up])
 
     def __call__(self, touches: Touches) -> None:
-        """Try one rotation angle with a grid of translations; the last calls refine the best."""
+        """Try one rotation angle with a grid of translations; the last calls search finely around the best result."""
         if self.step < len(TURNS):
             shifts, turn = _square(0.032, PITCH), TURNS[self.step]
         else:
@@ -150,7 +150,7 @@ class Localization:
         self.step += 1
 
     def _costs(self, touches: Touches, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
-        """Return the negative log-likelihood of each translation [m] along the table, for one rotation [rad]."""
+        """Return the negative log-probability of each translation [m] along the table, for one rotation [rad]."""
         surface_std, normal_std, shift_std, turn_std = 0.004, 0.3, 0.02, 0.15  # [m, 1, m, rad]
         gap, worst = 0.001, 20.0  # least distance [m] of a tip in the air; bound on the cost of one tip
         felt, (points, normals) = touches.felt, touches.means()

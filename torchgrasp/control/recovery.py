@@ -1,4 +1,4 @@
-"""Recovery when the object is not where it was seen: a guarded approach that stops at a touch, and a regrasp.
+"""Recovery when the object is not where it was seen: an approach that stops at a touch, and a second closing.
 
 Both locate the object from touches (`Localization`) and move the palm to the object.
 """
@@ -24,25 +24,25 @@ SPEED, CAREFUL_SPEED, ACCELERATION = 0.2, 0.08, 1.0
 PRESSING_TIME = 0.5  # time [s] from the end of closing until the hand counts as closed, and is judged
 
 MISPLACED = 0.008
-"""Distance [m] between object and palm from which the hand closes again: twice the error of `Localization`."""
+"""Distance [m] between the displacements of object and palm from which the hand opens: twice the estimate's error."""
 
 OPENING_TIME = 0.5  # time [s] in which the fingers open
 
 
 def can_guard(reference: ClosingReference) -> bool:
-    """Return whether a guarded approach is possible: table and surface are known, fingertips sense where they touch."""
+    """Return whether the hand can stop at a touch: it needs an approach, a table, a surface and tactile fingertips."""
     known = reference.approach is not None and reference.table is not None and reference.surface is not None
     return known and reference.sensor.kind == "tactile"
 
 
 class GuardedApproach:
-    """Move the opened hand to its pre-grasp, `length` [m] away, and stop when a fingertip touches (a guarded move).
+    """Move the opened hand to its pre-grasp, `length` [m] away, and stop it when a fingertip touches (guarded move).
 
-    After a stop the hand averages the touch, locates the object, retreats, moves its palm sideways and goes on. After
-    the last allowed stop it ignores touches.
+    After a stop the hand averages its touch readings, locates the object, retreats, moves its palm sideways and goes
+    on. After the last allowed stop the hand ignores touches.
 
-    `left` [m] is the remaining approach, `palm` [m] the palm's displacement from its planned path, `stops` the number
-    of stops, `displacement` [m, rad] the object's displacement at the last touch.
+    `left` [m] is the remaining length of the approach, `palm` [m] the palm's displacement from its planned path,
+    `stops` the number of stops. `displacement` holds the object's translation [m] and rotation [rad] at the last touch.
     """
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions, length: float) -> None:
@@ -59,7 +59,7 @@ class GuardedApproach:
         return self.left <= 0.0
 
     def __call__(self, observation: Observation, period: float) -> None:
-        """Update `left` and `palm` for the next tick."""
+        """Update `left` and `palm` for the next tick, `period` [s] later."""
         if self.feeling:
             self._feel(observation, period)
         elif self.left < self.retreat:
@@ -79,7 +79,7 @@ class GuardedApproach:
             self.left = max(self.left - self.speed * period, 0.0)
 
     def _feel(self, observation: Observation, period: float) -> None:
-        """Average the touch, then locate the object, then choose the new goal of the palm."""
+        """Average the touch readings, then locate the object, then choose the palm's new goal: one stage per call."""
         if self.time < 0.06:  # [s]
             self.time += period
             self.touches.add(observation, self.palm - self.left * self.direction)
@@ -96,8 +96,9 @@ class GuardedApproach:
 class GraspCheck:
     """Judge a pressing grasp: `judged` turns true when the result is known, `secure` says whether to lift.
 
-    The `displacement` [m, rad] of the object, as the closing estimated it, is located anew from the touches if the
-    surface was estimated. `palm` [m] is displaced from its plan. The grasp of the `last` attempt counts as secure.
+    `displacement` holds the object's translation [m] and rotation [rad] that the closing estimated; they are estimated
+    anew from the touches if the plan has table and surface. `palm` [m] is the palm's displacement from its plan. In the
+    `last` attempt every grasp counts as secure.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class GraspCheck:
         self.judged = self.secure = last
 
     def __call__(self, observation: Observation, pressed: float) -> None:
-        """Average the touches, locate the object, and judge after `PRESSING_TIME`; `pressed` [s] is the time so far."""
+        """Average the touches, locate the object, and judge the grasp once `pressed` [s] reaches `PRESSING_TIME`."""
         if self.judged or pressed < 0.1:
             return
         if pressed < 0.3:
@@ -122,7 +123,7 @@ class GraspCheck:
             self.judged, self.secure = True, self._is_secure()
 
     def _is_secure(self) -> bool:
-        """Return whether all fingers touch, their forces balance within friction, and the object is at the palm."""
+        """Return whether all fingers touch, friction lets forces balance, and the palm has followed the object."""
         touches = self.touches
         if not bool((touches.contact | ~touches.known).all()):
             return False
@@ -138,8 +139,8 @@ class GraspCheck:
 class Reopening:
     """Open the hand and move its palm to the displaced object; `done` says when the hand may close again.
 
-    The object has a `displacement` [m, rad], the hand the joint targets `joints` [rad]. The displacement `palm` [m]
-    changes to at most `reach` [m], and not at all if that is 0.
+    `displacement` holds the object's translation [m] and rotation [rad], `joints` the hand's present joint targets
+    [rad]. The palm's displacement `palm` [m] changes to at most `reach` [m], and not at all if `reach` is 0.
     """
 
     def __init__(
@@ -169,7 +170,7 @@ class Reopening:
 
 
 def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> Float[Tensor, "3"]:
-    """Return the palm displacement [m] that follows an object's `shift`: along the table, at most `reach`."""
+    """Return the palm displacement [m] that follows an object's `shift` [m] along the table, up to `reach` [m]."""
     if table is not None:
         up = unit(table.normal)
         shift = shift - (shift @ up) * up

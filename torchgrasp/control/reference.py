@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingReference(Value):
-    """The plan that a closing hand follows, in the hand's frame; joints are the actuated joints [rad].
+    """The plan for closing a hand on one grasp, in the hand's frame. Joints are the actuated joints [rad].
 
     Args:
         hand: the hand, in float64.
@@ -37,13 +37,13 @@ class ClosingReference(Value):
         obj_from_hand: planned pose of the hand in the frame of the grasp.
         pregrasp: joints of the opened hand.
         joints: joints of the grasp.
-        squeeze: joint targets that press without feedback, from `squeeze`.
+        squeeze: joint targets that press on the object without feedback, from `torchgrasp.control.squeeze`.
         normals: outward normals of the planned contacts.
-        gains: contacts, gains and desired forces (Eqs. 26-28).
+        gains: contacts, controller gains and desired forces (Eqs. 26-28 of the paper).
         approach: unit vector along which the opened hand moves to its pre-grasp; None means no approach.
         table: the table, which no fingertip enters while it searches, or None if it is unknown.
-        surface: estimated surface of the object in the frame of the grasp (`surface_field`), which locates the object
-            from touches. Without it, the tangent planes of the contacts are used.
+        surface: estimated surface of the object in the frame of the grasp (`surface_field`), with which touches are
+            compared to locate the object. Without it, the tangent planes of the contacts are used.
         sensor: sensors of the fingertips.
         max_force: largest normal force [N] of a fingertip; None means no limit.
 
@@ -78,15 +78,15 @@ class ClosingReference(Value):
         kp: Positive | None = None,
         stability: "StabilityModel | None" = None,
     ) -> "ClosingReference":
-        """Derive the closing plan of one grasp, on the CPU.
+        """Return the closing plan of one grasp, on the CPU.
 
         Args:
             hand: the hand.
             grasp: a single grasp, planned for the hand.
             force: normal force of the strongest finger [N].
             kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
-            stability: model that chooses among balanced forces of nearly equal friction, and gives their covariance;
-                without it the covariance grows with the force.
+            stability: model that chooses among balanced forces that need nearly equal friction, and gives the
+                covariance of the forces; without it the covariance grows with the force.
 
         Raises:
             BadArgument: not exactly one grasp, joints or fingers of another hand, a force or stiffness that is not
@@ -129,12 +129,12 @@ class ClosingReference(Value):
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
-        """Return all joints of the URDF from the actuated joints [rad]; NaN is allowed."""
+        """Return all joints of the URDF [rad] that belong to given actuated joints [rad]; NaN is allowed."""
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
-        """Return the actuated joints from all joints of the URDF [rad]; NaN is allowed."""
+        """Return the actuated joints [rad] among all joints of the URDF [rad]; NaN is allowed."""
         return joints[self._actuated]
 
     @functools.cached_property
@@ -144,7 +144,7 @@ class ClosingReference(Value):
 
     @property
     def alive(self) -> Bool[Tensor, "f"]:
-        """Whether each fingertip has a working sensor; `BadArgument` for a dead finger that the hand does not have."""
+        """Whether the sensor of each fingertip works; raises `BadArgument` if a dead finger is not of the hand."""
         names, dead = self.hand.finger_names, self.sensor.dead
         if not set(dead) <= set(names):
             raise BadArgument("sensor", f"dead fingers {dead}", f"dead fingers among {names}")
@@ -157,7 +157,7 @@ class ClosingReference(Value):
 
     @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-        """Return where fingertips with given centres [m] would touch: one tip radius towards the contact."""
+        """Return the points [m] where tips with given centres [m] would touch, one tip radius towards the contact."""
         return tips - self.hand.tips.radius[:, None] * self.normals
 
 
@@ -175,7 +175,10 @@ def next_target(
     lead: Float[Tensor, " h"] | float,
     period: float,
 ) -> Float[Tensor, " h"]:
-    """Return the joint target [rad] one tick later (Eq. 25); it leads the measured joints by at most `lead` [rad]."""
+    """Return the target of the actuated joints [rad] one tick later, for given velocities [m/s] of the fingertips.
+
+    No joint's target differs from the measured joint by more than `lead` [rad].
+    """
     jacobian = observation.jacobian @ reference.hand.actuated.coupling
     step = law.joint_step(jacobian, velocity, period, reference.joints - target)
     joints = reference.pick(observation.joints)
@@ -183,7 +186,7 @@ def next_target(
 
 
 def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:
-    """Return the unit approach direction of one grasp in the hand's frame, or None if there is none."""
+    """Return the unit approach direction of one grasp in the hand's frame, or None if the grasp has no approach."""
     direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
     return unit(direction) if bool((direction != 0.0).any()) else None
 
@@ -195,9 +198,9 @@ def closing_gains(
     force: Annotated[float, Range(0.01, 100.0)] = 4.0,
     stability: "StabilityModel | None" = None,
 ) -> ClosingGains:
-    """Return contact, gains and desired force of each finger for one grasp, in the hand's frame (Eqs. 26-28).
+    """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.
 
-    Arguments and errors are those of `ClosingReference.from_grasp`.
+    They are those of Eqs. (26)-(28) of the paper. Arguments and errors are as in `ClosingReference.from_grasp`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

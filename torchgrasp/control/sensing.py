@@ -28,14 +28,14 @@ from torchgrasp.control.tactile import (
 from torchgrasp.errors import BadArgument
 
 WAITING_FORCE = 0.3
-"""Largest force [N] of a finger that waits for the others, and the force that stands for a binary contact."""
+"""Largest force [N] of a finger that waits until the others touch, and the reading that stands for a binary contact."""
 
 TORQUE_NOISE = 0.01  # standard deviation [N m] of a sensed joint torque
 
 
 @checked
 def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileState:
-    """Return the tactile state of fingertips that sense only whether they touch.
+    """Return the tactile state of fingertips that sense only whether they touch; `tactile` is the last state.
 
     >>> feel_flags(no_contact(), torch.tensor([True, False, False])).reading
     tensor([0.3000, 0.0000, 0.0000], dtype=torch.float64)
@@ -59,11 +59,11 @@ def feel_torques(
         tactile: the state at the last tick.
         reference: the closing plan; its normals give the direction in which a finger presses.
         jacobian: Jacobian of the fingertips by all joints [m/rad], as in `Observation`.
-        torques: torques of all joints [N m] from contacts: without weight, friction and acceleration.
+        torques: torques of all joints [N m] that contacts cause, without those of weight, friction and acceleration.
         period: time since the last readings [s].
 
     Raises:
-        BadArgument: a jacobian of another hand.
+        BadArgument: a Jacobian with the shape of another hand.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -89,7 +89,7 @@ def feel_torques(
 
 
 def _forces_by_torques(reference: ClosingReference, jacobian: Float[Tensor, "f 3 j"]) -> Float[Tensor, "f 3 j"]:
-    """Return the map from joint torques [N m] to the most probable contact forces [N]; the prior is Gaussian."""
+    """Return the matrix that gives each finger's most probable contact force [N] from joint torques [N m]."""
     along = reference.normals[:, :, None] * reference.normals[:, None]
     across, up = ((TORQUE_NOISE / std) ** 2 for std in (0.5, 3.0))  # [N] across and along the normal
     prior = across * torch.eye(3, dtype=jacobian.dtype) + (up - across) * along
@@ -99,7 +99,7 @@ def _forces_by_torques(reference: ClosingReference, jacobian: Float[Tensor, "f 3
 class DriveFeel:
     """Estimate contact forces only from the joint drives: a blocked joint does not reach its target.
 
-    A drive of stiffness k and damping d exerts k (target - q) - d dq/dt.
+    A drive of stiffness k and damping d exerts the torque k (target - q) - d dq/dt at the joint angle q.
     """
 
     def __init__(self, reference: ClosingReference) -> None:
@@ -121,7 +121,7 @@ class DriveFeel:
 
 
 class FingertipSensor:
-    """Simulate the fingertip sensors that a `SensorModel` describes.
+    """Simulate the fingertip sensors that a `SensorModel` describes: a call takes true contacts, and returns readings.
 
     Args:
         reference: the closing plan, with the sensor model.
@@ -171,7 +171,7 @@ class FingertipSensor:
         return self.reports[0]
 
     def _torques(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"]) -> Float[Tensor, " j"]:
-        """Return the torques [N m] of all joints that contacts cause, with the noise of the sensors."""
+        """Return the torques [N m] that the true contacts cause at all joints, with the noise of the torque sensors."""
         torques = torch.einsum("fcj,fc->j", jacobian, truth.forces)
         if self.generator is not None:
             drawn = torch.randn(len(torques), generator=self.generator, dtype=torques.dtype)

@@ -28,8 +28,8 @@ STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays
 class TipContact(Value):
     """True contacts of f fingertips, averaged over a tick.
 
-    `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN without contact.
-    `sliding` [m/s] is the speed of the tip along the surface; None means that no tip slides.
+    `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN for tips without
+    contact. `sliding` [m/s] is the speed of each tip along the surface; None means that no tip slides.
     """
 
     normal_force: Float[Tensor, "*b f"]
@@ -68,7 +68,7 @@ class TactileState(Value):
 
 @checked
 def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
-    """Return the tactile state of fingertips that touch nothing; the next tick samples them.
+    """Return the tactile state of fingertips that touch nothing, with leading axes `batch`; the next tick samples them.
 
     >>> no_contact().contact
     tensor([False, False, False])
@@ -89,12 +89,12 @@ def measure(
     generator: torch.Generator | None = None,
     noise: Annotated[float, Range(0.0, 100.0)] = 1.0,
 ) -> TactileState:
-    """Return the tactile state one tick later.
+    """Return the simulated tactile state one tick later, with lag, noise and sampling of the sensors.
 
     Args:
         tactile: the state at the last tick.
         truth: true contacts during the tick.
-        pads: outward surface normals at the planned contacts, for the noise of tips that touch nothing.
+        pads: outward surface normals at the planned contacts, which direct the noise of tips that touch nothing.
         radius: radius of the tips [m]; 0 means that they are not round, and 12 mm is assumed.
         period: period of the tick [s].
         generator: draws the noise; without one there is no noise.
@@ -137,7 +137,10 @@ def measure(
 
 
 def flag(before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: Float[Tensor, "f"] | float) -> Tensor:
-    """Return contact flags with hysteresis; `factor` scales the thresholds by the sensor's noise."""
+    """Return contact flags from the flags `before` and the low-passed force `average` [N], with hysteresis.
+
+    `factor` multiplies the two thresholds, for noisier sensors.
+    """
     return torch.where(before, average > 0.5 * TOUCH_ON * factor, average > TOUCH_ON * factor)
 
 
@@ -168,7 +171,7 @@ class Observation(Value):
     Args:
         joints: all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
         tips: centres of the fingertips [m].
-        jacobian: Jacobian of these centres by all joints [m/rad].
+        jacobian: Jacobian of these centres with respect to all joints [m/rad].
         tactile: readings of the fingertips.
     """
 
@@ -197,7 +200,7 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
 
 
 def joint_jacobian(hand: Hand, joints: Float[Tensor, " j"], points: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3 j"]:
-    """Return the Jacobian [m/rad] of points on the fingertips by each URDF joint, as if no joints were coupled."""
+    """Return the Jacobian [m/rad] of points [m] on the fingertips for all URDF joints, as if no joints were coupled."""
     axes, origins = hand.tree.joint_axes(hand.tree.poses(joints[None])[0])
     turning = torch.linalg.cross(axes.expand(len(points), -1, 3), points[:, None] - origins)
     columns = torch.where(hand.tree.prismatic[:, None] > 0, axes, turning)

@@ -30,12 +30,12 @@ LEAD = 0.04
 class UncertaintyClosing:
     """The default closing controller: the paper's control law (Eqs. 25-28) with extensions.
 
-    * A finger in the air searches along its contact's normal, even beyond the contact, but not below the table. A
-      finger that touches is force-controlled, whatever its position error.
+    * A finger that does not touch searches along the normal of its planned contact, even beyond the contact, but not
+      below the table. A finger that touches is force-controlled, whatever its position error.
     * Before the first touch the fingers keep pace: all reach their contacts at the same time.
     * A finger without a working sensor rests at its estimated contact until the others touch. Then it searches until
       its drives feel a contact, or until it is three standard deviations beyond the contact.
-    * The components of `ClosingOptions` that act while the fingers close: `wait`, `pose_estimate` and `palm_reach`.
+    * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers close.
     """
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:
@@ -55,18 +55,18 @@ class UncertaintyClosing:
         return self.settled.time >= SETTLED or (self.waits and self.waiting >= PATIENCE)
 
     def begin_at(self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]) -> "UncertaintyClosing":
-        """Start with a displaced palm [m]; the prior mean of the object's displacement is `displacement` [m, rad]."""
+        """Set the palm's initial displacement [m] and the object's expected displacement [m, rad]; return `self`."""
         self.planes, self.palm = ContactPlanes(self.reference, displacement), palm
         self.displacement = displacement
         return self
 
     def press(self) -> "UncertaintyClosing":
-        """Let the fingers that wait press with their desired forces, and keep the palm where it is."""
+        """Let the fingers, which may be waiting, press with the desired forces, and keep the palm; return `self`."""
         self.waits, self.reach = False, 0.0
         return self
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick."""
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         reference, gains, normals = self.reference, self.reference.gains, self.reference.normals
         contact, reading = observation.tactile.contact, observation.tactile.reading
         tips = observation.tips + self.palm
@@ -99,7 +99,7 @@ class UncertaintyClosing:
         return reference.expand(self.target)
 
     def _follow(self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]) -> tuple[Tensor, Tensor]:
-        """Return the contact points [m] on the displaced object (f, 3), and the velocity [m/s] of the palm."""
+        """Return the planned contacts [m] on the displaced object (f, 3), and the palm's velocity (3,) [m/s]."""
         if self.planes is None:
             return self.reference.gains.target, STILL
         self.displacement = self.planes.displacement(points, contact)
@@ -112,7 +112,7 @@ class UncertaintyClosing:
     def _without_sensor(
         self, observation: Observation, ahead: Float[Tensor, "f"], contact: Bool[Tensor, "f"], period: float
     ) -> tuple[Bool[Tensor, "f"], Bool[Tensor, "f"]]:
-        """Return which fingers without a sensor probably touch, and which stop until the others touch."""
+        """Return which fingers without a working sensor probably touch, and which of them wait for the others."""
         blind = ~self.alive
         if self.drives is None:
             return blind, blind
@@ -126,7 +126,7 @@ class UncertaintyClosing:
     def _desired(
         self, reading: Float[Tensor, "f"], contact: Bool[Tensor, "f"], rests: Bool[Tensor, "f"]
     ) -> Float[Tensor, "f"]:
-        """Return the desired normal force [N] of each finger. If its sensor is dead, the force error is zero."""
+        """Return the desired normal force [N] of each finger; if the sensor is dead, the force error is zero."""
         desired = -(self.reference.gains.desired_force * self.reference.normals).sum(-1)
         if self.waits:
             rest = WAITING_FORCE if bool(contact.all()) else reading.clamp_max(WAITING_FORCE)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
-"""CoACD's search for cuts, narrower and faster than its default."""
+"""Settings of CoACD's search for cuts, which make it narrower and faster than by default."""
 
 _log = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ def read_solid(
 
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
-    """Return the convex hull of points; the points are rounded if Qhull would return an open hull."""
+    """Return the convex hull of points; the points are rounded if the mesh of the hull would not be closed."""
     import trimesh
 
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -85,7 +85,7 @@ def hull(corners: np.ndarray) -> "trimesh.Trimesh":
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the caller's convex parts; raise `MeshError` for parts that are not convex, and for too many."""
+    """Return the caller's parts as a list; raise `MeshError` if one is not convex, or for none or too many parts."""
     max_parts = 1000  # most parts that a caller may give
     if len(parts) > max_parts:
         raise MeshError("parts", f"{len(parts)} parts", f"at most {max_parts}")
@@ -99,7 +99,7 @@ def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 
 
 def _fingerprint(mesh: "trimesh.Trimesh") -> str:
-    """Return a SHA-256 of the mesh and the settings of the decomposition, the key of the cache."""
+    """Return the cache's key for a mesh: a SHA-256 of the mesh and of the settings with which it is cut."""
     digest = hashlib.sha256(f"coacd 0.05 {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
@@ -107,7 +107,7 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
 
 
 def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
-    """Write the corners of all parts to a cache file."""
+    """Write the vertices of all parts to a cache file."""
     tensors = {
         "vertices": torch.cat([torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]),
         "counts": torch.tensor([len(p.vertices) for p in parts]),
@@ -116,7 +116,7 @@ def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
 
 
 def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
-    """Read the parts of a cache file as hulls of their corners; refuse corners far outside the mesh."""
+    """Read the parts of a cache file as hulls of their vertices; raise an error for vertices far outside the mesh."""
     from scipy.spatial import QhullError
 
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})

@@ -1,6 +1,7 @@
-"""CoACD in a separate process with limits of time and memory, which ends with its parent.
+"""Cut meshes into convex parts by CoACD, in a separate process with limits of time and memory.
 
-CoACD itself has no limits and delays signals. The process runs this file, which needs only numpy and CoACD.
+CoACD itself has no limits and delays signals. The process runs this file, which needs only numpy and CoACD, and ends
+with its parent process.
 """
 
 import importlib.util
@@ -22,9 +23,9 @@ SECONDS, SECONDS_PER_FACE = 60.0, 0.005  # processor time [s] that a mesh may ta
 
 
 def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return vertices and faces of the convex parts into which CoACD cuts a mesh.
+    """Return vertices and faces of each convex part into which CoACD cuts a mesh; `search` holds CoACD's settings.
 
-    Raises `MeshError` if CoACD takes more time or memory than the size of the mesh allows.
+    Raises `MeshError` if CoACD takes more time or memory than is allowed for a mesh of this size.
     """
     from torchgrasp.errors import MeshError, MissingExtra
 
@@ -53,7 +54,7 @@ def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.
 
 
 def main(asked: dict[str, Any]) -> None:
-    """Read a mesh from stdin, decompose it within the limits, and write the convex parts to stdout."""
+    """Read a mesh from stdin, cut it within the limits of `asked`, and write the convex parts to stdout."""
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     _limit(asked["seconds"], asked["memory"])
     import coacd

@@ -1,4 +1,4 @@
-"""A simulated scene in MuJoCo, and its model as MJCF."""
+"""A simulated scene in MuJoCo, and its model in MJCF, MuJoCo's XML format."""
 
 import functools
 import xml.etree.ElementTree as ET
@@ -15,13 +15,13 @@ from torchgrasp.sim.scene import STILL, ContactPoint, Scene
 from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, pair_masks
 
 OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
-"""Names of the object (its body and its free joint), of the table, and of the neighbours by number."""
+"""Names of the object (its body and its free joint), of the table, and of the neighbours, which are numbered."""
 
 HAND_BIT, OBJECT_BIT, TABLE_BIT, FREE_BIT = 1, 2, 4, 3
-"""Collision groups, all of which collide except the hand with itself, and the first bit after them."""
+"""Bits of three collision groups, which all collide except the hand with itself; number of the first bit after them."""
 
 OPTION = {"integrator": "implicitfast", "cone": "elliptic", "impratio": "10", "noslip_iterations": "2"}
-"""Of the solver, from DexGraspBench (arXiv 2412.16490)."""
+"""Options of MuJoCo's solver, from DexGraspBench (arXiv 2412.16490)."""
 
 SOLREF, SOLIMP = "0.005 1", "0.5 0.99 0.0001"
 """Contact springs: time constant [s] and damping ratio, and impedance over depth, as in DexGraspBench."""
@@ -63,7 +63,7 @@ class MujocoScene(Scene):
         mujoco.mj_step1(model, data)
 
     def _advance(self) -> Iterator[tuple[int, int, Callable[[], list[ContactPoint]]]]:
-        """Advance by one timestep; yield two bodies that touch, and the function that reads their contact point."""
+        """Advance by one timestep; yield each pair of bodies that touch, with a function that reads their contact."""
         if self._diverged():
             return
         self._mujoco.mj_step2(self.model, self.data)
@@ -72,7 +72,7 @@ class MujocoScene(Scene):
         self._mujoco.mj_step1(self.model, self.data)
 
     def _read(self, k: int) -> list[ContactPoint]:
-        """Return the point of contact k."""
+        """Return a list with the contact point number k of MuJoCo's present contacts."""
         wrench, found = np.zeros(6), self.data.contact
         self._mujoco.mj_contactForce(self.model, self.data, k, wrench)
         axes = found.frame[k].reshape(3, 3)  # in rows; the first points from the first body to the second
@@ -92,14 +92,14 @@ class MujocoScene(Scene):
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the geometric Jacobian (f, 3, j) of points on the fingertips."""
+        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the driven joints."""
         jacobian = np.zeros((len(self.tips), 3, self.model.nv))
         for rows, point, tip in zip(jacobian, points, self.tips, strict=True):
             self._mujoco.mj_jac(self.model, self.data, rows, None, point, tip)
         return jacobian[:, :, self._velocities]
 
     def penetration(self) -> float:
-        """Return the largest penetration depth [m] of the hand, itself included."""
+        """Return the largest depth [m] by which the hand penetrates another body or itself."""
         deepest = 0.0
         for (first, second), distance in zip(self.data.contact.geom, self.data.contact.dist, strict=True):
             if not {self._body_of[first], self._body_of[second]} <= self._place_of.keys():
@@ -114,7 +114,7 @@ class MujocoScene(Scene):
         return False
 
     def _pose(self, body: int) -> np.ndarray:
-        """Return the pose (4, 4) of a body, given its index."""
+        """Return the pose (4, 4) of a body in the world's frame, given its index."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
         return pose
@@ -125,7 +125,7 @@ class MujocoScene(Scene):
 
 
 def _import_mujoco() -> Any:
-    """Import MuJoCo; its warnings are counted (`_diverged`) instead of written to a file."""
+    """Import and return MuJoCo; its warnings are no longer written to a file, only counted."""
     try:
         import mujoco
     except ImportError as error:
@@ -137,7 +137,7 @@ def _import_mujoco() -> Any:
 
 
 def scene_mjcf(spec: SceneSpec) -> str:
-    """Return the MJCF model of a scene as XML, with all joints at zero and a position servo for each joint."""
+    """Return MuJoCo's XML model of a scene (MJCF), with all joints at zero and a position servo for each joint."""
     urdf = spec.urdf
     movable = [joint.name for joint in urdf.joints if joint.kind != "fixed"]
     spec.check_drives(movable)
@@ -168,7 +168,7 @@ def scene_mjcf(spec: SceneSpec) -> str:
 
 
 def _add_body(asset: ET.Element, world: ET.Element, name: str, spec: Body, hits: int) -> None:
-    """Add a free body with uniform density, and the collision groups that it hits."""
+    """Add a free body of uniform density; `hits` are the bits of the collision groups with which it collides."""
     body = ET.SubElement(world, "body", name=name)
     ET.SubElement(body, "freejoint", name=name)
     _weigh(body, spec.mass, spec.mesh.center_mass, spec.inertia[np.triu_indices(3)])
@@ -212,7 +212,7 @@ def add_links(
 def _add_link(
     parent: ET.Element, link: Link, place: Iterable[float], rotation: np.ndarray, masks: Mapping[str, tuple[int, int]]
 ) -> ET.Element:
-    """Add a link of the hand, with its collision shapes, to its parent's body."""
+    """Add a link of the hand, with its collision shapes, to the body of its parent; return the link's body."""
     body = ET.SubElement(parent, "body", _frame(place, rotation), name=link.name, gravcomp="1")
     if link.mass > 0:
         _weigh(body, link.mass, link.com, link.inertia)
@@ -226,7 +226,7 @@ def _add_link(
 
 
 def add_drive(actuator: ET.Element, joint: str, drive: Actuator) -> None:
-    """Add a position servo: torque kp (target - q) - kd dq/dt, limited to the drive's effort."""
+    """Add a position servo to a joint of position q: torque kp (target - q) - kd dq/dt, at most the drive's effort."""
     gains = {"kp": repr(drive.kp), "kv": repr(drive.kd), "forcerange": format_numbers((-drive.effort, drive.effort))}
     ET.SubElement(actuator, "position", gains, name=joint, joint=joint)
 
@@ -239,12 +239,12 @@ def _weigh(body: ET.Element, mass: float, centre: Iterable[float], inertia: Iter
 
 
 def _bits(kind: int, others: int) -> dict[str, str]:
-    """Return a shape's collision group, and the groups that it collides with, as attributes."""
+    """Return MJCF attributes of a shape: the bit of its collision group, and the bits of groups it collides with."""
     return {"contype": str(kind), "conaffinity": str(others)}
 
 
 def _frame(place: Iterable[float], rotation: np.ndarray) -> dict[str, str]:
-    """Return a pose as MJCF attributes: position and the first two axes."""
+    """Return a pose as MJCF attributes: the position [m], and the first two axes of the rotation matrix."""
     return {"pos": format_numbers(place), "xyaxes": format_numbers(rotation[:, :2].T.ravel())}
 
 

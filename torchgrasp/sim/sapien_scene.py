@@ -2,7 +2,7 @@
 
 Settings that differ from SAPIEN's defaults:
 
-* Joints get an armature: without it the implicit drives lose torque in a contact.
+* Joints get an armature (inertia of the motor): without it the implicit drives lose torque in a contact.
 * The hand's links feel no gravity, and collide with each other only in the pairs that the scene names.
 * Sleeping is off, because a sleeping body keeps stale contacts.
 * The object's inertia is set with its mass.
@@ -34,7 +34,7 @@ from torchgrasp.sim.scene_spec import (
 
 
 def open_world(sapien: Any, physx: Any, gravity: float, timestep: float) -> tuple[Any, Any]:
-    """Return an empty physics system and its scene; gravity [m/s^2], timestep [s]."""
+    """Return an empty physics system and its scene, with given gravity [m/s^2] and timestep [s]."""
     physx.set_scene_config(gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=True, enable_pcm=True)
     physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
     physx.set_body_config(solver_position_iterations=10, solver_velocity_iterations=1, sleep_threshold=0.0)
@@ -45,7 +45,7 @@ def open_world(sapien: Any, physx: Any, gravity: float, timestep: float) -> tupl
 
 
 def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) -> None:
-    """Add an entity with one body to the scene, at a height [m]."""
+    """Add an entity with one body to the scene, with the body's origin at a `height` [m] on the world's z axis."""
     entity = sapien.Entity()
     entity.name = name
     entity.add_component(body)
@@ -54,7 +54,7 @@ def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) ->
 
 
 def table(physx: Any, material: Any) -> Any:
-    """Return a static box, the table."""
+    """Return the body of the table, a static box."""
     body = physx.PhysxRigidStaticComponent()
     body.attach(physx.PhysxCollisionShapeBox(np.array(TABLE, np.float32) / 2, material))
     return body
@@ -81,7 +81,7 @@ def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, patch: float)
 
 
 def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
-    """Load the hand on its mount, and set it to its initial posture."""
+    """Load the hand on its mount, set it to its initial posture, and return it."""
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
@@ -114,7 +114,7 @@ def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
 
 
 def import_sapien() -> tuple[Any, Any]:
-    """Import SAPIEN; its warning about a missing Vulkan is suppressed, because physics does not need it."""
+    """Import SAPIEN and its physics module; no warning tells that Vulkan is missing, because physics works without."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -167,7 +167,7 @@ class SapienScene(Scene):
         self._tip_index = [self.hand.links.index(tip) for tip in self.tips]
 
     def _advance(self) -> Iterator[tuple[Any, Any, Callable[[], Iterable[ContactPoint]]]]:
-        """Advance by one timestep; yield two bodies that touch, and the function that reads their contact points."""
+        """Advance by one timestep; yield each pair of bodies that touch, with a function that reads their contacts."""
         if self._pulled:
             self.body.add_force_torque(self._force, self._torque)
         self.scene.step()
@@ -175,7 +175,7 @@ class SapienScene(Scene):
             yield *contact.bodies, functools.partial(_read, contact)
 
     def step(self) -> StepContacts:
-        """Advance by one timestep and report the contacts, with the forces that sensors at the tips' bases measure.
+        """Advance by one timestep and return the sums of the contacts, with forces measured at the tips' base joints.
 
         SAPIEN reports contacts without friction, but the complete wrench at each link's joint, in the joint's frame.
         """
@@ -203,7 +203,7 @@ class SapienScene(Scene):
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the geometric Jacobian (f, 3, j) of points on the fingertips."""
+        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the driven joints."""
         frames = np.array([_matrix(link.entity_pose) for link in self._children]) @ self._frames
         axes, arms = frames[:, :3, 0], points[:, None, :] - frames[:, :3, 3]
         following, last = [1, 2, 0], [2, 0, 1]  # coordinates of a cross product; np.cross takes much longer
@@ -212,7 +212,7 @@ class SapienScene(Scene):
         return columns.transpose(0, 2, 1)
 
     def penetration(self) -> float:
-        """Return the largest penetration depth [m] of the hand, itself included, after a step without gravity."""
+        """Return the largest depth [m] by which the hand penetrates a body or itself, after a step without gravity."""
         bodies = [self.body, *self.neighbours]
         for body in bodies:
             body.disable_gravity = True
@@ -223,7 +223,7 @@ class SapienScene(Scene):
         return max((float(-point.separation) for contact in touching for point in contact.points), default=0.0)
 
     def _pose(self, body: Any) -> np.ndarray:
-        """Return the pose (4, 4) of a body of the scene."""
+        """Return the pose (4, 4) of a body in the world's frame."""
         return _matrix(body.entity_pose)
 
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
@@ -238,7 +238,7 @@ def _matrix(pose: Any) -> np.ndarray:
 
 
 def _read(contact: Any) -> Iterator[ContactPoint]:
-    """Yield the points of a contact; SAPIEN reports the impulse on its first body."""
+    """Yield the points of a contact, with the impulse on its second body; SAPIEN reports that on the first body."""
     for point in contact.points:
         impulse = point.impulse
         yield ContactPoint(-impulse, float(np.sqrt(impulse.dot(impulse))), point.position)

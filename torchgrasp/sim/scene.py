@@ -17,7 +17,7 @@ from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, 
 STILL = np.zeros(3)  # no force, no torque
 
 NEIGHBOURS, TABLETOP, TARGET = range(3)
-"""Places in `StepContacts.stray`: contacts of the hand that are not a finger's with the object."""
+"""Indices into `StepContacts.stray`, which sums contacts of the hand other than those of fingers with the object."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,15 +44,16 @@ class StepContacts:
     @classmethod
     @checked
     def none(cls, fingers: Annotated[int, Range(1, 1000)] = 3) -> "StepContacts":
-        """Return sums without any contact."""
+        """Return the sums of a step without any contact, all of them zero, for a number of fingers."""
         impulse, moment, force = np.zeros((3, fingers, 3))
         return cls(impulse, moment, np.zeros(fingers), np.zeros(fingers, dtype=bool), force, np.zeros(3))
 
 
 class ContactPoint(NamedTuple):
-    """A point where two bodies touch: impulse on the second body (3,) [N s] and its size, and position (3,) [m].
+    """A point where two bodies touch, at `place` (3,) [m], with the normal impulse on the second body (3,) [N s].
 
-    `force` (3,) [N] on the second body includes friction; 0 if the simulator reports it elsewhere.
+    `size` [N s] is the length of the impulse. `force` (3,) [N] on the second body includes friction; it is 0 if the
+    simulator does not report friction at contact points.
     """
 
     impulse: np.ndarray
@@ -79,9 +80,10 @@ class Scene(abc.ABC):
         self.timestep, self.centre = spec.timestep, np.asarray(spec.mesh.center_mass, float)
 
     def _map_contacts(self, tables: Iterable[Any], carriers: Iterable[Any]) -> None:
-        """Map bodies to their place in `StepContacts.stray`, and links to fingers.
+        """Store which index into `StepContacts.stray` belongs to each body, and which finger to each link.
 
-        `carriers` holds for each fingertip the link that carries it rigidly, or None.
+        `tables` are the bodies of the table. `carriers` holds for each fingertip the link that carries it rigidly, or
+        None.
         """
         self._place_of = {self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
         self._place_of |= dict.fromkeys(tables, TABLETOP)
@@ -91,7 +93,7 @@ class Scene(abc.ABC):
                 self._finger_of.setdefault(carrier, i)
 
     def step(self) -> StepContacts:
-        """Advance by one timestep and report the contacts between fingertips and object."""
+        """Advance by one timestep and return the sums of the contacts between fingertips and object."""
         contacts = StepContacts.none(len(self.tips))
         for first, second, read in self._advance():
             if (first in self._place_of) == (second in self._place_of):
@@ -113,7 +115,7 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def _advance(self) -> Iterable[tuple[Any, Any, Callable[[], Iterable[ContactPoint]]]]:
-        """Advance by one timestep; yield two bodies that touch, and the function that reads their contact points."""
+        """Advance by one timestep; yield each pair of bodies that touch, with a function that reads their contacts."""
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:
@@ -129,15 +131,15 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) of points on the fingertips by the driven joints."""
+        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the driven joints."""
 
     @abc.abstractmethod
     def penetration(self) -> float:
-        """Return the largest initial penetration depth [m] of the hand, itself included."""
+        """Return the largest depth [m] by which the hand, at the start, penetrates another body or itself."""
 
     @abc.abstractmethod
     def _pose(self, body: Any) -> np.ndarray:
-        """Return the pose (4, 4) of a body, given its handle."""
+        """Return the pose (4, 4) of a body in the world's frame, given the simulator's handle of the body."""
 
     @abc.abstractmethod
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
@@ -145,17 +147,17 @@ class Scene(abc.ABC):
 
     @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the target height [m] and the speed [m/s] of the hand's lift."""
+        """Set the target height [m] to which the mount lifts the hand, and the target speed [m/s]."""
         self._move_mount(LIFT_JOINT, height, speed)
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set the target of the remaining approach length [m], and the speed [m/s]."""
+        """Set the target of the approach, as the length `left` [m] that then remains, and the speed [m/s]."""
         self._move_mount(APPROACH_JOINT, -left, speed)
 
     @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
-        """Set the target displacement [m] of the hand from its path and its velocity [m/s], if the mount can yield."""
+        """Set the hand's target displacement (3,) [m] from its path and velocity (3,) [m/s], if the mount yields."""
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
             if vector.shape != (3,) or vector.dtype.kind not in "iuf":
                 raise BadArgument(name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers")
@@ -163,17 +165,17 @@ class Scene(abc.ABC):
             self._move_mount(joint, target, speed)
 
     def neighbour_poses(self) -> np.ndarray:
-        """Return the poses (m, 4, 4) of the neighbours."""
+        """Return the poses (m, 4, 4) of the m neighbours in the world's frame."""
         return np.array([self._pose(body) for body in self.neighbours]).reshape(-1, 4, 4)
 
     def object_pose(self) -> np.ndarray:
-        """Return the object's pose (4, 4)."""
+        """Return the object's pose (4, 4) in the world's frame."""
         return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) of the hand's root, after at least one step."""
+        """Return the pose (4, 4) of the hand's root link in the world's frame; it is valid after the first step."""
         return self._pose(self.root)
 
     def tip_poses(self) -> np.ndarray:
-        """Return the poses (f, 4, 4) of the fingertip links."""
+        """Return the poses (f, 4, 4) of the links of the f fingertips in the world's frame."""
         return np.array([self._pose(tip) for tip in self.tips])

@@ -25,10 +25,10 @@ ARMATURE = 1e-3  # inertia [kg m^2] that each motor's rotor adds to its joint; P
 TABLE = (2.0, 2.0, 0.1)  # size of the table [m]
 
 LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
-"""Prismatic joints of the mount: along the world's z axis, and along the approach, where 0 is the hand's pose."""
+"""Names of the mount's prismatic joints along the world's z axis, and along the approach; at 0 the approach ends."""
 
 SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z")
-"""Prismatic joints of a mount that yields, along the world's axes."""
+"""Names of the prismatic joints of a mount that yields, along the world's axes."""
 
 
 @checked
@@ -70,8 +70,8 @@ class SceneSpec:
         urdf_path: URDF of the hand.
         world_from_hand: pose of the hand (4, 4).
         joints: start position of every joint of the URDF by name [rad].
-        drives: drive of every joint by name.
-        tip_links: links of the f fingertips, in grasp order.
+        drives: motor of every joint of the URDF by name.
+        tip_links: names of the links of the f fingertips, in the order of the grasp's contacts.
         mesh: closed mesh of the object, which gives table height, centre of mass and inertia.
         parts: convex bodies that make up the object.
         mass: mass of the object [kg].
@@ -110,12 +110,12 @@ class SceneSpec:
 
     @functools.cached_property
     def urdf(self) -> Urdf:
-        """The URDF of the hand; raises `HandFileError` if it is not valid."""
+        """The parsed URDF of the hand; raises `HandFileError` if the file is not valid."""
         return read_urdf(self.urdf_path)
 
     @functools.cached_property
     def slides(self) -> list["Slide"]:
-        """The prismatic joints of the mount, from the world to the hand."""
+        """The prismatic joints of the mount, in their order from the world to the hand."""
         slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, self.travel + 0.05, 0.0)]
         length = float(np.linalg.norm(self.approach))
         if length > 0:
@@ -139,7 +139,7 @@ class SceneSpec:
 
     @checked
     def check_drives(self, names: list[str]) -> None:
-        """Raise `BadArgument` for joints without an initial position or a drive."""
+        """Raise `BadArgument` if a joint in `names` has no initial position or no drive."""
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
             raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
@@ -152,7 +152,7 @@ WRIST_JOINT = "torchgrasp_wrist"  # name of the fixed joint between mount and ha
 
 
 class Slide(NamedTuple):
-    """A prismatic joint of the mount: name, axis in the world, limits and start [m]."""
+    """A prismatic joint of the mount: name, unit axis in the world's frame, limits [m] and start position [m]."""
 
     name: str
     axis: tuple[float, float, float]
@@ -162,7 +162,7 @@ class Slide(NamedTuple):
 
 
 def mounted_urdf(spec: SceneSpec) -> str:
-    """Return the URDF of the hand on its mount.
+    """Return the URDF of the hand on its mount, as XML text.
 
     `<visual>` elements are left out, because they need a render device. `<mimic>` elements are left out, because
     SAPIEN's mimic joints transmit wrong forces; coupled joints get their own targets instead.
@@ -211,7 +211,7 @@ def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[
     """Return for each link in `pairs` two bit masks: its collision group, and the groups that it collides with.
 
     Two links collide if the group of one shares a bit with the mask of the other, as in PhysX and MuJoCo. Only one link
-    of each pair needs its own bit; `first` is the first free bit. Pairs that need more bits raise `HandFileError`.
+    of each pair needs its own bit; bits from number `first` are free. `HandFileError` is raised if they do not suffice.
     """
     bits = 31  # MuJoCo's masks are signed numbers of 32 bits
     left = [tuple(pair) for pair in pairs]

@@ -43,10 +43,10 @@ class SimulatedHand:
     """The simulated hand for a controller: it takes targets, and returns observations of joints and fingertip sensors.
 
     `truth` holds the contacts of the last tick. `force` (f,) are the true normal forces [N], averaged over the tick,
-    `pushes` (f, 3) the full forces. `finger` flags contacts in the last step. `steps` counts steps of the simulator.
-    `first_touch` is the step of each fingertip's first contact, infinite before. `first_stray` is the step of the first
-    contact of each kind in `StepContacts.stray`, `stray` the sum of their impulses [N s], and `most_stray` their
-    largest force [N] over a tick.
+    `pushes` (f, 3) the full forces. `finger` (f,) tells which fingers touched the object in the last step. `steps`
+    counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before it.
+    Three attributes are about the hand's other contacts, by kind as in `StepContacts.stray`: `first_stray` is the step
+    of the first contact, `stray` the sum of the impulses [N s], `most_stray` the largest force [N] over a tick.
 
     Args:
         scene: a scene at its initial state.
@@ -78,7 +78,7 @@ class SimulatedHand:
 
     @checked
     def tick(self, targets: Targets) -> Observation:
-        """Drive joints and palm for one control period; return the observation at its end."""
+        """Drive joints and palm towards their targets for one control period; return the observation at its end."""
         if len(targets.joints) != len(self._to_scene):
             raise BadArgument("targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF")
         self.scene.drive(targets.joints.numpy()[self._to_scene])
@@ -107,7 +107,7 @@ class SimulatedHand:
         return self._observe(contacts)
 
     def unbalanced(self) -> float:
-        """Return the ratio of the resultant of all fingertip forces to the sum of their sizes; NaN without forces."""
+        """Return the size of the sum of all fingertip forces over the sum of their sizes; NaN without any forces."""
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan
 
@@ -117,7 +117,7 @@ class SimulatedHand:
         return max(1, round(seconds / self.period))
 
     def _observe(self, contacts: StepContacts) -> Observation:
-        """Return the observation of the hand, given the true contacts of the tick."""
+        """Return what the hand measures at the end of a tick, given the sums of the true contacts during the tick."""
         world_from_hand = self.scene.hand_pose()
         rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
         tips = self.scene.tip_poses()

@@ -26,10 +26,11 @@ GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the 
 
 
 class PaperClosing:
-    """The paper's control law (Eqs. 25-28), with a damped inverse and limits of gain and speed.
+    """The paper's control law (Eqs. 25-28), with a damped inverse of the Jacobian and limits of gain and speed.
 
-    No joint target leads its joint by more than the drive can exert. The closing ends when all fingers touch, each
-    blend (Eq. 26) is at least 0.5, and the forces have been steady for `SETTLED` seconds.
+    No joint target is so far ahead of its joint that the drive would exceed its torque limit. The closing ends when
+    all fingers touch, the share of force control (lambda, Eq. 26) is at least 0.5 in each, and the forces have been
+    steady for `SETTLED` seconds.
     """
 
     palm = STILL
@@ -50,7 +51,7 @@ class PaperClosing:
         return self
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick."""
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         reference, gains, normals = self.reference, self.reference.gains, self.reference.normals
         error = gains.target - reference.contact_points(observation.tips)
         self.share = blend(error, gains.covariance)
@@ -76,7 +77,7 @@ class Settled:
         period: float,
         pressing: bool = True,
     ) -> None:
-        """Update the time by one tick: all fingers must touch and, with `pressing`, press steadily."""
+        """Update `time` [s] by one tick: all fingers must touch and, with `pressing`, press steadily, else it is 0."""
         average = observation.tactile.average
         settled = bool(touching.all())
         if pressing:
@@ -87,7 +88,7 @@ class Settled:
 
 
 def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
-    """Return the lead [rad] of each actuated joint's target at which its drive exerts its largest torque."""
+    """Return how far [rad] each joint's target is ahead of the joint at the largest torque of its drive."""
     hand = reference.hand
     effort = torch.tensor([hand.actuators[name].effort for name in hand.tree.joint_names], dtype=torch.float64)
     leads = (effort / reference.kp)[:, None] / hand.actuated.coupling.abs()  # infinite where nothing is driven
@@ -97,8 +98,8 @@ def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
 class PositionClosing:
     """The paper's baseline (Table 7): a PI position controller for each fingertip, stopped at `STOP_FORCE`.
 
-    The goal lies `depth` [m] behind the planned contact. With the paper's depth of 0 a finger may stop before it
-    touches.
+    The goal lies `depth` [m] behind the planned contact, inside the object. With the paper's depth of 0 a finger may
+    stop before it touches.
     """
 
     palm = STILL
@@ -112,7 +113,7 @@ class PositionClosing:
         self.done = False
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick."""
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         reference, stop_distance, integral_rate = self.reference, 1e-3, 2.0  # [m], [1/s^2]
         error = self.aim - reference.contact_points(observation.tips)
         arrived = torch.linalg.vector_norm(error, dim=-1) < stop_distance
@@ -127,7 +128,7 @@ class PositionClosing:
 
 
 class OpenLoopClosing:
-    """Move the joints from pre-grasp to grasp to squeeze targets, without any sensor."""
+    """Move the joints from the pre-grasp to the grasp, and on to targets that press, without any sensor."""
 
     palm = STILL
 
@@ -138,7 +139,7 @@ class OpenLoopClosing:
         self.time, self.done = 0.0, False
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick."""
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
         progress = min(self.time / POSE_TIME, 2.0)
         self.done = self.time >= 2 * POSE_TIME - 0.5 * period
@@ -147,9 +148,10 @@ class OpenLoopClosing:
 
 
 def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:
-    """Return the spring's force [N] and torque [N m] that pull the fingertips' frame back to its rest pose.
+    """Return the force [N] and torque [N m] of a spring that pulls the fingertips' frame back to its `rest` pose.
 
-    The frame is the virtual frame of three fingertips (Eq. 18); the torque grows with the sine of the rotation error.
+    `hand_from_vf` is the virtual frame of three fingertips, with its origin at their centroid (Eq. 18 of the paper).
+    The torque grows with the sine of the rotation error.
     """
     axes, desired = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
     error = 0.5 * torch.linalg.cross(axes, desired).sum(-2)
@@ -160,7 +162,7 @@ def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, 
 def shared_forces(
     points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the smallest fingertip forces that exert a wrench, scaled so that none exceeds `most` [N]."""
+    """Return the smallest fingertip forces [N] that exert a wrench, all scaled down if one would exceed `most` [N]."""
     forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
     largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
@@ -179,11 +181,12 @@ def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 
 class Impedance:
-    """Hold the object like a spring between the fingertips: object-level impedance, by joint targets q + J^T f / kp.
+    """Hold the object as if springs held three fingertips together and in their place (object-level impedance).
 
-    At rest the forces are the desired forces, balanced at the sensed contacts. Null-space motions of the joints are
-    suppressed. Springs of stiffness `springs` [N/m], by default `GRASP_STIFFNESS`, act along the sides of the triangle
-    of fingertips. If the `stability` model, where given, judges the grasp unstable, forces and stiffness stay raised.
+    The joint targets are q + J^T f / kp for fingertip forces f. At rest f are the desired forces, balanced at the
+    sensed contacts. Joint motions that leave the fingertips at rest are suppressed. Springs of stiffness `springs`
+    [N/m], by default `GRASP_STIFFNESS`, act along the sides of the triangle of fingertips. If a `stability` model is
+    given and judges the grasp unstable, forces and stiffness are raised and stay so.
     """
 
     def __init__(
@@ -207,7 +210,7 @@ class Impedance:
         self.reading = observation.tactile.reading
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints for the next tick."""
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
         self.reading = self.reading + low_pass(2.0, period) * (observation.tactile.reading - self.reading)
@@ -222,7 +225,7 @@ class Impedance:
         return self.reference.expand(posture + drift + self.lead + share * (lead - self.lead))
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """If the grasp is unstable, raise its forces, and its stiffness to that of stable grasps of the same size."""
+        """If the grasp is unstable, raise its forces, and bring its stiffness to that of stable grasps of its size."""
         if self.stability is None or self.time < RAMP + 0.3:  # the filtered readings must have followed the forces
             return
         state = state_of(self.springs, lengths_of(observation.tips), self.reading)
@@ -234,7 +237,7 @@ class Impedance:
 
     @checked
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-        """Return the fingertips' forces on the object [N]."""
+        """Return the forces [N] of the fingertips on the object, given the centres `tips` [m] of the fingertips."""
         frame = self._frame(tips)
         desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
         most = torch.linalg.vector_norm(desired, dim=-1).amax()  # the wrench lifts no finger
@@ -242,7 +245,7 @@ class Impedance:
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
 
     def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-        """Return the virtual frame of the fingertips, or the last one if the tips are on a line."""
+        """Return the frame of the triangle of fingertips, or the last valid frame if the tips are on a line."""
         if not bool(degenerate(tips)):
             self.frame = virtual_frame(tips)
         return self.frame

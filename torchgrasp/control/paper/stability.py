@@ -1,4 +1,4 @@
-"""The learned stability model [6]: Gaussian mixtures over stiffness, size and tactile forces of grasps.
+"""The learned stability model, from the paper's reference [6]: Gaussian mixtures over stiffness, size and forces.
 
 `scripts/train.py stability` fits two mixtures to simulated pulls, of stable and of unstable grasps. The first gives the
 forces of stable grasps and Sigma_fd of Eq. (28). Both give the probability of stability by Bayes' rule: the density of
@@ -39,19 +39,19 @@ PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return the state of a grasp, logarithms of springs [N/m], tip distances (`lengths_of`) [m] and forces [N]."""
+    """Return a grasp's state: logarithms of spring stiffness [N/m], `lengths_of` the tips [m] and normal forces [N]."""
     return torch.cat([springs, lengths, forces.clamp_min(LEAST_FORCE)], -1).log()
 
 
 def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the distances [m] of three fingertips' centres from the origin of their virtual frame (Eq. 18)."""
+    """Return the distances [m] of three fingertips' centres from their centroid."""
     return torch.linalg.vector_norm(tips - tips.mean(-2, keepdim=True), dim=-1)
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class PreferredForces(Value):
-    """Normal forces [N] of stable grasps, their covariance [N^2], and the stiffness [N/m] of the springs."""
+    """Typical normal forces [N] of stable grasps, their covariance [N^2], and the typical spring stiffness [N/m]."""
 
     forces: Float[Tensor, "3"]
     covariance: Float[Tensor, "3 3"]
@@ -67,7 +67,7 @@ class StabilityModel(Value):
         stable: density of the states of stable grasps.
         others: density of the states of all other grasps.
         share: fraction of training trials that were stable: the prior probability.
-        meta: hand, bodies, trials, seed, and the scores on held-out bodies.
+        meta: texts about the training: hand, bodies, trials, seed, and the scores on held-out bodies.
     """
 
     stable: GaussianMixture
@@ -82,9 +82,9 @@ class StabilityModel(Value):
 
     @checked
     def preferred_forces(self, tips: Float[Tensor, "3 3"], force: Positive | None = None) -> PreferredForces:
-        """Return forces and stiffness of stable grasps with the same distances between the `tips` [m] [6].
+        """Return the typical forces and stiffness of stable grasps whose fingertips are as far apart as the `tips` [m].
 
-        `force` [N] is that of the finger that presses hardest; by default the model's own.
+        `force` [N] is the normal force of the finger that presses hardest; by default the model chooses it.
         """
         lengths = lengths_of(tips.double())
         given = dict(zip(LENGTHS, lengths.log().tolist(), strict=True))
@@ -104,7 +104,7 @@ class StabilityModel(Value):
 
     @checked(gradients=True)
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
-        """Return the log-odds that a grasp is stable, by Bayes' rule on stiffness and forces."""
+        """Return the log-odds that a grasp of given `state` is stable, by Bayes' rule on stiffness and forces."""
         stable, others = self._without_lengths
         judged = torch.cat([state[..., :3], state[..., 6:]], -1)
         return stable.log_prob(judged) - others.log_prob(judged) + math.log(self.share / (1 - self.share))
@@ -116,7 +116,7 @@ class StabilityModel(Value):
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the model as safetensors, atomically; `load_stability` reads it."""
+        """Write the model to a safetensors file, atomically, and return its path; `load_stability` reads the file."""
         tensors = {f"{kind}.{part}": getattr(getattr(self, kind), part) for kind, part in PARTS}
         return save_tensors(path, "stability", tensors, {**self.meta, "share": repr(self.share)})
 
@@ -127,7 +127,7 @@ def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel
 
     Raises:
         ModelFileError: the file is missing or malformed.
-        BadArgument: it is the model of another hand.
+        BadArgument: the model is that of another hand.
     """
     if path is None:
         path = hand.urdf_path.parent / FILE
