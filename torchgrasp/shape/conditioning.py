@@ -1,6 +1,7 @@
-"""From observations to the posterior, Eqs. (7)-(8): from all at once, from later ones, from the most informative.
+"""The posterior given observations, Eqs. (7)-(8) of the paper: all at once, added later, or the most informative.
 
-Each function builds one Cholesky factor L of K + noise. Further observations append rows to L.
+Each function builds one Cholesky factor L of K + noise, the covariance of the observed numbers. Further observations
+append rows to L.
 """
 
 import dataclasses
@@ -46,10 +47,10 @@ def longest_distance(x: Float[Tensor, "n 3"]) -> float:
 
 
 def append_observations(old: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None) -> Posterior:
-    """Return the old given `new` observations besides the old: equal to conditioning on all at once.
+    """Return the posterior given the old and the `new` observations; it equals conditioning on all at once.
 
     The factor L grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
-    `shared` are correlated errors of the new distances, one column for each independent cause.
+    `shared` are correlated errors of the new distances, normalised, one column for each independent cause.
     """
     kernel = old.kernel
     if shared is not None:
@@ -73,7 +74,7 @@ def append_observations(old: Posterior, new: Observations, shared: Float[Tensor,
 
 @dataclasses.dataclass(frozen=True)
 class Selection(Value):
-    """The indices of the picked candidates, in order, and the posterior given them."""
+    """The indices of the picked candidates, in the order of picking, and the posterior that includes them."""
 
     picks: Int[Tensor, "picks"]
     posterior: Posterior
@@ -87,9 +88,10 @@ def select_points(
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Pick the candidates to observe, each the most informative given those picked before; all have normals.
+    """Pick at most `budget` candidates to observe, each the most informative given `known` and earlier picks.
 
-    Each pick appends four rows to the factor (pivoted Cholesky). The selection ends when no variance exceeds `stop`.
+    All candidates have normals. Each pick appends four rows to the Cholesky factor. The selection ends when no
+    candidate's variance exceeds `stop`.
     """
     x, start = candidates.x, posterior_given(known, kernel)
     n, budget = len(x), min(budget, len(x))
@@ -135,7 +137,7 @@ def select_points(
 
 
 def _score(criterion: Criterion, variance: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Return how informative each candidate is."""
+    """Return how informative each candidate is; a higher score is more informative."""
     if criterion == "variance":
         return variance
     if criterion == "error":
@@ -150,9 +152,9 @@ def _extend(
     whitened: Float[Tensor, "rows"],
     new_order: Int[Tensor, "fresh"] | None = None,
 ) -> Posterior:
-    """Return the posterior given `new` observations too, points with normals first; `whitened` is L^-1 y.
+    """Return the posterior given `new` observations too, from the grown Cholesky factor L and `whitened` = L^-1 y.
 
-    `new_order` gives the row of `Observations.rows` for each new row of the grown factor L, by default the same.
+    `new_order` gives, for each new row of L, its place in `new.rows()`; by default, the order is the same.
     """
     n, has = len(posterior.x), torch.cat([posterior.has_normal, new.has_normal])
     points = torch.argsort(~has, stable=True)

@@ -62,35 +62,36 @@ def fit_shape(
     kernel: KernelName | Kernel = "thin_plate",
     criterion: Criterion = "variance",
 ) -> ShapeGP:
-    """Return the Gaussian process posterior of an object's shape, given a partial point cloud, Eqs. (2)-(9).
+    """Return the Gaussian process posterior of an object's shape given a partial cloud, Eqs. (2)-(9) of the paper.
 
     With `support` "camera" the cloud is cleaned and signed distances are true to scale. The object's outline and the
     mirrored cloud are added as noisier observations. The shape is kept out of free space and of the table.
 
-    With "paper" the cloud's centre is observed at d = -1, and 20 random points around it at d = +1.
+    With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1, and 20 random points around it at +1.
 
     Args:
-        cloud: points [m] of one object, of one view or of several (`merge_clouds`), prepared by `prepare_cloud`. Given
-            normals distinguish a whole surface from a view. Walls thinner than the cloud's spacing merge, but an open
-            vessel seen from above on a `table` has two walls (`HollowShape`).
-        noise: standard deviation of an observed signed distance, normalised. If `support` is "paper", also of a normal.
+        cloud: points [m] of one object from one view or several (`merge_clouds`); `prepare_cloud` is applied. Normals,
+            if they are given, tell whether the points cover the whole surface. Walls thinner than the cloud's spacing
+            merge, but an open vessel seen from above on a `table` becomes a `HollowShape` with two surfaces.
+        noise: standard deviation of an observed signed distance, in radii of the object. If `support` is "paper",
+            also of a normal.
         budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. The default
-            is 85 for "camera", outline and mirrored points not counted, and 70 for "paper". "sure" adds points until no
-            point's variance exceeds `noise`, the paper's rule, at most 1000.
-        psi_scale: ratio of the kernel's psi to the longest distance of the observations; below 1.34 the covariance may
-            be indefinite.
-        support: "camera" or "paper".
+            is 85 for "camera", which does not count points of the outline and mirrored points, and 70 for "paper".
+            "sure", the paper's rule, adds points until no point's variance exceeds `noise`, at most 1000.
+        psi_scale: ratio of the kernel's length psi to the longest distance between observed points; below 1.34 the
+            covariance may be indefinite.
+        support: observations besides the cloud's points, "camera" or "paper"; see above.
         seed: random seed.
         table: the table's plane, or its height [m] along z; only "camera" uses it.
-        kernel: "thin_plate", "matern52" or "rbf" with the length of psi (`kernel_by_name`); or a `Kernel` of normalised
-            distances.
-        criterion: the most informative point has the greatest "variance"; the greatest "error", |mean distance|; or the
-            greatest sum of "both", |error| + 2 sqrt(variance).
+        kernel: "thin_plate", "matern52" or "rbf", whose length psi sets (`kernel_by_name`); or your own `Kernel` of
+            normalised distances.
+        criterion: what is greatest at the most informative point: the "variance" of its distance, the "error"
+            |mean distance|, or "both", |error| + 2 sqrt(variance).
 
     Raises:
         BadArgument: an argument out of range; a table above the object's foot; a cloud that `prepare_cloud` refuses; a
             view that is not wholly in front of its camera; for "camera" a whole surface without normals.
-        TooFewPoints: see `prepare_cloud`.
+        TooFewPoints: too few points are left; see `prepare_cloud`.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
     >>> from torchgrasp.geometry.linalg import unit
@@ -106,7 +107,7 @@ def fit_shape(
 
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
-    """Options of a shape fit; see the arguments of `fit_shape`."""
+    """Options of a shape fit, which are arguments of `fit_shape`."""
 
     noise: float = 0.01
     budget: int | Literal["sure"] | None = None
@@ -117,7 +118,7 @@ class FitOptions:
 
 
 def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitOptions) -> ShapeGP:
-    """Fit the shape in the `upright_frame` to a cloud without duplicate points; `table` is the table's height [m]."""
+    """Fit the shape to a cloud without duplicates in a frame whose z axis is up; `table` is the table's height [m]."""
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
     generator, noise = torch.Generator().manual_seed(seed), options.noise
@@ -141,7 +142,7 @@ def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitO
 
 
 def _fit_surface(seen: PreparedCloud, support: Support, options: FitOptions) -> ShapeGP:
-    """Return the posterior of one surface, in the upright frame, from the cloud and its supporting observations."""
+    """Return the posterior of one surface, in the upright frame, given the cloud and the additional observations."""
     cloud, points, normals = seen.cloud, seen.points, seen.normals
     if support.rows is not None:
         points, normals = points[support.rows], normals[support.rows]
@@ -184,14 +185,14 @@ def condition(
     std_factor: Positive = 1.0,
     kernel: KernelName | Kernel = "thin_plate",
 ) -> ShapeGP:
-    """Return the shape given normalised observations, Eqs. (7)-(9).
+    """Return the posterior of a shape given normalised observations, Eqs. (7)-(9) of the paper.
 
     Args:
-        observations: distances and normals, with their noise.
+        observations: signed distances and normals at points, with their noise, all normalised.
         normalisation: centre and scale of the normalised frame.
         cloud: the points that the camera saw [m].
-        psi_scale: ratio of psi to the longest distance of the observations; the paper's 1 makes the covariance
-            indefinite.
+        psi_scale: ratio of the kernel's length psi to the longest distance between observed points; the paper's value 1
+            makes the covariance indefinite.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
         kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
 

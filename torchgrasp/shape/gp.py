@@ -1,4 +1,4 @@
-"""The shape as a Gaussian process over signed distance and normal, Eqs. (1), (7)-(9), with an interface in metres."""
+"""The shape as a Gaussian process over signed distance and normal, with an interface in metres; Eqs. (1), (7)-(9)."""
 
 import dataclasses
 from typing import Annotated, Any
@@ -31,7 +31,7 @@ MAX_JOINT = 1000  # most points of one joint posterior: its memory grows with th
 
 @dataclasses.dataclass(frozen=True)
 class ShapeGP(Posterior, Normalisation):
-    """The posterior of an object's shape: g of Eq. (1) given observations. `fit_shape` returns it.
+    """The posterior of an object's signed distance function, Eq. (1) of the paper, given observations; see `fit_shape`.
 
     `predict`, `mean`, `mean_and_gradient`, `normalise` and `metres` are differentiable. Other methods refuse points
     that require a gradient.
@@ -63,7 +63,7 @@ class ShapeGP(Posterior, Normalisation):
     def of(
         cls, posterior: Posterior, frame: Normalisation, cloud: PointCloud, psi: Positive, std_factor: Positive = 1.0
     ) -> "ShapeGP":
-        """Return the shape of a posterior; its domain follows from kernel and observations."""
+        """Return the shape of a posterior in a normalised frame; its domain follows from kernel and observations."""
         # Far from all observations the posterior has no information.
         reach = 1.25 * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
         radius = min(posterior.kernel.diameter / 2.0, reach)
@@ -83,12 +83,12 @@ class ShapeGP(Posterior, Normalisation):
 
     @property
     def walls(self) -> "tuple[ShapeGP, ...]":
-        """The surfaces that enclose the material, each a shape: here only this one."""
+        """The surfaces that enclose the material, each a shape; an object that is not hollow has only one."""
         return (self,)
 
     @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Return which of the `walls` is the surface at normalised points."""
+        """Return a mask (points, walls): which of the `walls` is the surface at each normalised point."""
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
     @checked(gradients=True)
@@ -98,7 +98,7 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
-        """Return signed distance, normal and their covariance at points [m] in the cloud's frame, Eqs. (7)-(8).
+        """Return signed distance, normal and covariance at points [m] in the cloud's frame, Eqs. (7)-(8) of the paper.
 
         The estimate has the dtype of `points`. First derivatives flow back to points that require a gradient, except
         from `covariance`.
@@ -126,7 +126,7 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return the derivatives of distance, normal, variance and std_m by the query points [m]. Raises as `predict`.
+        """Return the derivatives of the results of `predict` by the query points, per metre; raises the same errors.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> view = load_object("jug").view
@@ -162,7 +162,7 @@ class ShapeGP(Posterior, Normalisation):
     def sample(
         self, points: Float[Tensor, "k 3"], n: Annotated[int, Range(0, 1_000_000)], seed: Seed = 0
     ) -> Float[Tensor, "n k 4"]:
-        """Draw n joint samples of distance and gradient, normalised, at up to 1000 points [m].
+        """Draw n joint samples of distance and gradient, in normalised units, at up to 1000 points [m].
 
         Raises the errors of `predict`.
         """
@@ -210,7 +210,7 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":
-        """Return the shape given further normalised observations; kernel and domain do not change."""
+        """Return the shape given further observations in the normalised frame; kernel and domain do not change."""
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 
     @checked
@@ -255,5 +255,5 @@ def _reshape(rows: Float[Tensor, "q *c"], points: Float[Tensor, "*b 3"]) -> Tens
 
 
 def common_fields(value: Value, kind: type[Value]) -> dict[str, Any]:
-    """Return those fields of a value that the class `kind` also has."""
+    """Return the fields, by name, that a value shares with the class `kind`."""
     return {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]

@@ -29,7 +29,7 @@ class HollowShape(ShapeGP):
     mean distance gives distance, normal and covariance. Errors of the two surfaces are independent.
 
     Args:
-        inner: the inner surface, positive inside the vessel and negative around it.
+        inner: the inner surface; its signed distance is positive in the vessel's cavity and negative around the cavity.
 
     >>> import trimesh
     >>> from torchgrasp import fit_shape
@@ -44,7 +44,7 @@ class HollowShape(ShapeGP):
     @classmethod
     @checked
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
-        """Return the vessel with two surfaces in the same normalised frame; `cloud` holds the seen points of both."""
+        """Return the vessel with two given surfaces, in one normalised frame; `cloud` holds the seen points of both."""
         radius = min(outer.domain_radius, inner.domain_radius)
         return cls(**common_fields(outer, ShapeGP) | {"cloud": cloud, "domain_radius": radius}, inner=inner)
 
@@ -60,7 +60,7 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Return whether the outer or the inner surface applies at normalised points."""
+        """Return a mask (points, 2): whether the outer or the inner surface applies at each normalised point."""
         inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
 
@@ -83,13 +83,13 @@ class HollowShape(ShapeGP):
 
     @checked
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return mean and variance of the distance with derivatives, at normalised points."""
+        """Return mean and variance of the signed distance with their derivatives, at normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.jet(own))
         return map_tensors(merge, *parts)
 
     @checked
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
-        """Return the mean distance with derivatives, at normalised points."""
+        """Return the mean signed distance with its derivatives, at normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.mean_jet(own))
         return map_tensors(merge, *parts)
 
@@ -105,7 +105,7 @@ class HollowShape(ShapeGP):
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
-        """Return the shape given further normalised observations; each belongs to the wall at its point."""
+        """Return the shape given further normalised observations; each changes the surface that applies there."""
         outer, inner = self.wall_at(new.x).T
         return self.join(self.outer.append(new[outer]), self.inner.append(new[inner]), self.cloud)
 
@@ -118,7 +118,7 @@ class HollowShape(ShapeGP):
     def _by_wall(
         self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], Found]
     ) -> tuple[list[Found], Callable[..., Tensor]]:
-        """Evaluate each wall at the points where it is the surface; also return the function that merges the rows."""
+        """Evaluate each wall at the points where it applies; also return a function that merges results in order."""
         rows = [torch.nonzero(own)[:, 0] for own in self.wall_at(x).T]
         back = torch.argsort(torch.cat(rows))
         return [evaluate(w, x[own]) for w, own in zip(self.walls, rows, strict=True)], lambda *y: torch.cat(y)[back]
@@ -127,8 +127,8 @@ class HollowShape(ShapeGP):
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
     """Return the vessel after adding observations that give its wall the known thickness.
 
-    Two independent surfaces might touch, which tears holes into the wall. In its middle the two distances must add up
-    to minus the thickness; otherwise the more certain surface gives an observation of the other.
+    Two independent surfaces might touch, which tears holes into the wall. In the wall's middle the distances must add
+    up to minus the thickness; otherwise the more certain surface gives an observation of the other.
     """
     x, thickness, noise = middle.x, middle.thickness, 0.0007 / shape.scale
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Radial kernels k(r), and the covariances of signed distances and normals that follow from them, Eqs. (2)-(6).
+"""Radial kernels k(r), and the covariances of signed distances and normals that follow, Eqs. (2)-(6) of the paper.
 
 Autograd of the scalar profile k(r) defines all derivatives. A kernel may add a closed form as a speed-up.
 """
@@ -29,11 +29,11 @@ class Kernel:
     """A radial kernel k(r) of normalised distances.
 
     Args:
-        profile: k(r).
+        profile: the function k(r).
         diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it is a covariance
             everywhere.
         remedy: fix that the error suggests if the covariance is not positive definite.
-        closed_form: a faster `differentiate` of this profile, called with `r` and `count`; by default autograd.
+        closed_form: function of `r` and `count` that returns the derivatives faster than autograd, the default.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]
@@ -47,7 +47,7 @@ class Kernel:
 
     @checked
     def derivatives(self, r: Float[Tensor, "*s"], count: Orders) -> tuple[Float[Tensor, "*s"], ...]:
-        """Return the first `count` of k and its derivatives in r^2 / 2; see `differentiate`."""
+        """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, elementwise; see `differentiate`."""
         return differentiate(self.profile, r, count) if self.closed_form is None else self.closed_form(r, count)
 
 
@@ -80,14 +80,14 @@ def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[
 
 
 def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
-    """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, Eq. (6): a covariance in a ball of diameter 3/4 psi."""
+    """Return 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper: it is a covariance in a ball of diameter 3/4 psi."""
     # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals need it.
     return r * r * (2.0 * r - 3.0 * psi) + psi**3
 
 
 @checked
 def thin_plate_kernel(psi: Positive) -> Kernel:
-    """Return the thin plate kernel with the closed form of its derivatives.
+    """Return the thin plate kernel of the length `psi`, normalised, with its derivatives in closed form.
 
     >>> kernel = thin_plate_kernel(psi=2.0)
     >>> kernel.diameter
@@ -110,7 +110,7 @@ def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor
 
 @checked
 def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
-    """Return Matern 5/2: variance (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) r / length.
+    """Return the Matern 5/2 kernel: variance (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) r / length.
 
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
@@ -135,7 +135,7 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return a kernel by name; all have the same prior variances, psi^3 of distance and 6 psi of slope."""
+    """Return a kernel by name; all have the prior variance psi^3 of the distance and 6 psi of a gradient component."""
     if name == "thin_plate":
         return thin_plate_kernel(psi)
     if name == "matern52":
@@ -146,10 +146,10 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
 def cross_covariance(
     kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], n_oriented: int
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the covariance of distance and gradient (d, w) at x with the observations at y, Eqs. (2)-(5).
+    """Return the covariance of distance and gradient at x with the observations at y, Eqs. (2)-(5) of the paper.
 
-    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T with d = x - y and derivatives in r^2 / 2. Columns: d of all,
-    then w1, w2, w3 of the first `n_oriented`, which have normals.
+    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T with d = x - y and derivatives by r^2 / 2. The columns are the
+    distances at all y, then each gradient component at the first `n_oriented`, which have normals.
     """
     n = len(y)
     d, r = separations(x, y)
@@ -182,7 +182,7 @@ def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[
 def covariance_rows(
     kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int, y: Float[Tensor, "m 3"], other_oriented: int
 ) -> Float[Tensor, "rows columns"]:
-    """Return the covariance of two lists of observations; the first `n_oriented` or `other_oriented` have normals."""
+    """Return the covariance of observations at x and y; the first `n_oriented` and `other_oriented` have normals."""
     block = cross_covariance(kernel, x, y, other_oriented)
     if n_oriented == len(x):
         return block.flatten(0, 1)

@@ -1,4 +1,4 @@
-"""The Gaussian process posterior in the normalised frame: mean, derivatives and covariances, Eqs. (7)-(8)."""
+"""The Gaussian process posterior in the normalised frame: mean, derivatives, covariances; Eqs. (7)-(8) of the paper."""
 
 import dataclasses
 from functools import cached_property, partial
@@ -16,16 +16,16 @@ from torchgrasp.shape.values import JointEstimate, MeanJet, SurfaceJet, pass_gra
 
 @dataclasses.dataclass(frozen=True)
 class Posterior(Value):
-    """A Gaussian process given observed distances and normals; normalised, in float64.
+    """A Gaussian process given observed distances and normals, in normalised units and float64.
 
-    `mean` and `mean_and_gradient` are differentiable once. All other methods refuse points that require a gradient. (d,
-    w) are signed distance and its gradient.
+    `mean` and `mean_and_gradient` are differentiable once. All other methods refuse points that require a gradient.
+    (d, w) are the signed distance and its gradient.
 
     Args:
         x: observed points, those with normals first.
-        weights: (K + noise)^-1 y, in the order of `gram`'s rows.
-        factor: lower Cholesky factor of K + noise. Later observations are last, wherever their points are in `x`.
-        order: row of `gram` for each row of the factor; by default the same.
+        weights: (K + noise)^-1 y for the observed numbers y: first all distances, then the normals by component.
+        factor: lower Cholesky factor of K + noise. Rows of later observations come last, which `x` does not ensure.
+        order: for each row of `factor`, its row in `weights`; None if the order is the same.
     """
 
     x: Float[Tensor, "n 3"]
@@ -37,7 +37,7 @@ class Posterior(Value):
 
     @cached_property
     def precision(self) -> Float[Tensor, "rows rows"]:
-        """(K + noise)^-1, in the order of `gram`'s rows."""
+        """The inverse covariance (K + noise)^-1 of the observed numbers, in the order of `weights`."""
         inverse = torch.cholesky_inverse(self.factor)
         if self.order is None:
             return inverse
@@ -46,7 +46,7 @@ class Posterior(Value):
 
     @cached_property
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """Blocks of columns of L^-T, without the zeros below, for fast products with the factor L."""
+        """L^-T of the Cholesky factor L, for fast products: in blocks of columns, without the zeros below."""
         rows, tile = len(self.factor), 24  # matrix products are fastest with a multiple of so many columns
         one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)
         inverse = torch.linalg.solve_triangular(self.factor, one, upper=False)
@@ -60,7 +60,7 @@ class Posterior(Value):
 
     @checked
     def ordered(self, rows: Shaped[Tensor, "rows *c"]) -> Shaped[Tensor, "rows *c"]:
-        """Return rows, given in the order of `gram`, in the order of the factor."""
+        """Return rows, given in the order of `weights`, in the order of the rows of `factor`."""
         return rows if self.order is None else rows[self.order]
 
     @checked(gradients=True)
@@ -102,7 +102,7 @@ class Posterior(Value):
 
     @checked
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
-        """Return the mean and the covariance of (d, w) at normalised points, Eqs. (7)-(8)."""
+        """Return the mean and the covariance of (d, w) at normalised points, Eqs. (7)-(8) of the paper."""
         prior, rows = self.prior_block(), len(self.factor)
 
         def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,13 +135,13 @@ class Posterior(Value):
 
     @checked
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
-        """Return the mean distance with its derivatives, which costs much less than `jet` with the variance."""
+        """Return the mean distance with first and second derivatives at normalised points, at less cost than `jet`."""
         size = 256 if x.device.type == "cpu" else 16384
         return MeanJet(*in_chunks(lambda part: _mean_jet(self, part)[0], x, size))
 
     @checked
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at any number of normalised points, Eqs. (7)-(8)."""
+        """Return the joint posterior of (d, w) at any number of normalised points, Eqs. (7)-(8) of the paper."""
         k = len(x)
         cross = self.cross(x)
         mean = (cross @ self.weights).T
@@ -158,20 +158,23 @@ class Posterior(Value):
 
     @checked
     def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
-        """Return the covariance of the distances at points with all observations, the first block of `cross`."""
+        """Return the covariance of the distances at normalised points with all observed numbers, one row per point."""
         d, r = separations(x, self.x)
         k, first = self.kernel.derivatives(r, 2)
         return _distance_rows(d, k, first, self.n_oriented)
 
     @checked
     def whiten(self, rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
-        """Return covariances with the observations, times L^-T; products of results are explained covariances."""
+        """Return rows of covariances with the observed numbers, times L^-T of the Cholesky factor L.
+
+        The dot product of two results is the covariance that the observations explain.
+        """
         rows = rows if self.order is None else rows[:, self.order]
         return torch.cat([rows[:, : len(block)] @ block for block in self.whiteners], 1)
 
     @checked
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
-        """Return the covariance of (d, w) at points with all observations."""
+        """Return the covariance of distance and gradient (d, w) at normalised points with all observed numbers."""
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
     def _split_weights(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "near 3"]]:
@@ -182,7 +185,7 @@ class Posterior(Value):
 
 Values = Float[Tensor, "q n"]
 Kernels = tuple[list[Tensor], Values, Values, Float[Tensor, "q near"]]
-"""Differences from the observations, k, k' and, where there are normals, k''."""
+"""Components of the differences from the observed points, k, k', and k'' for the points with normals."""
 
 
 def _mean_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
@@ -223,7 +226,7 @@ def _jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor,
 
 
 def _distance_rows(d: list[Tensor], k: Values, first: Values, near: int) -> Float[Tensor, "q rows"]:
-    """Return the covariance of distances with the observations: k, then -k' d where normals are observed."""
+    """Return the covariance of distances with the observed numbers: k, then -k' d for each component of the normals."""
     return torch.cat([k, *(-(part[:, :near] * first[:, :near]) for part in d)], 1)
 
 
@@ -233,14 +236,14 @@ def _sum_differences(c: Float[Tensor, "q n"], x: Float[Tensor, "q 3"], y: Float[
 
 
 def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
-    """Return the covariance (k, k) of the signed distances within each set of k normalised points, Eq. (8)."""
+    """Return the covariance (k, k) of the signed distances in each set of k normalised points, Eq. (8) of the paper."""
     return combined_covariance(posterior, x[:, :, None], x.new_ones(1, 1, 1, 1))
 
 
 def combined_covariance(
     posterior: Posterior, x: Float[Tensor, "b g p 3"], weights: Float[Tensor, "#b #g m p"]
 ) -> Float[Tensor, "b v v"]:
-    """Return the covariance of weighted sums of distances: m sums for each of g groups of p points, v = g m."""
+    """Return the covariance of weighted sums of distances: m sums for each of g groups of p points, so v = g m sums."""
     (b, g, p), rows = x.shape[:3], len(posterior.factor)
     v, points = g * weights.shape[2], x.flatten(1, 2)
     cross = posterior.distance_rows(points.flatten(0, 1)).view(b, g, p, rows)
@@ -254,8 +257,8 @@ def combined_covariance(
 def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, fix: str) -> Float[Tensor, "*b k k"]:
     """Return the symmetric square root of covariance matrices, unique even with equal eigenvalues.
 
-    Eigenvalues of zero, as of coinciding points, may be negative by rounding. Larger ones, relative to the `prior`
-    variance, raise `IndefiniteCovariance`, whose message ends with `fix`.
+    Rounding may turn eigenvalues of zero, as of coinciding points, slightly negative; they count as zero. More negative
+    ones, relative to the `prior` variance, raise `IndefiniteCovariance`, whose message ends with `fix`.
     """
     values, vectors = torch.linalg.eigh(covariance)
     if values.numel() and not float(values.min()) >= -1e-8 * prior:

@@ -19,7 +19,7 @@ from torchgrasp.values import PointCloud
 OUTER_POINTS, OUTER_RADIUS = 20, 1.2  # number of points outside, and normalised radius of their sphere (Sec. 3.1)
 OUTER_NOISE = 0.3  # standard deviation, normalised, of a distance outside: the nearest of sparse points is too far away
 NORMAL_NOISE, RIM_NORMAL_NOISE, HIDDEN_NORMAL_NOISE = 0.05, 0.5, 0.25
-"""Standard deviations of normals: of a seen one, of one on the outline, and of one on the hidden side."""
+"""Standard deviations of unit normals: on the seen side, on the outline, and on the hidden side."""
 RIM_NOISE = 0.002  # standard deviation [m] of a point of the outline
 FREE_NOISE = 0.003  # standard deviation [m] of a distance observed in free space: it is only a lower bound
 OUTLINE_ERROR = 0.005  # the object may reach this far [m] beyond its outline: a camera loses rims
@@ -30,7 +30,7 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
     ("guess", True): 1.0, ("cut off", True): 2.0, ("whole", True): 0.5,
     ("guess", False): 1.0, ("cut off", False): 2.0, ("whole", False): 0.5,
 }  # fmt: skip
-"""Real deviations over the posterior's, by the kind of the hidden side and whether the table is known.
+"""Ratio of real errors to the posterior's standard deviations, by kind of hidden side and whether the table is known.
 
 `scripts/train.py bands DIR` fits them."""
 
@@ -45,7 +45,7 @@ class Support(Value):
 
     Args:
         frame: normalised frame.
-        anchors: points inside and outside, without normals.
+        anchors: observed distances at points inside and outside the object, without normals.
         normal_noise: standard deviation of the cloud's normals.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
         parts: observed points of the outline and of the hidden side.
@@ -65,7 +65,7 @@ class Support(Value):
 
 
 def paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> Support:
-    """Return the paper's supporting observations: the centre, and random points outside (Sec. 3.1)."""
+    """Return the additional observations of the paper: the centre, and random points outside (Sec. 3.1)."""
     center = seen.points.mean(0)
     scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
     sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(center)
@@ -75,7 +75,7 @@ def paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator)
 
 
 def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
-    """Return the normalised frame of points: centre of their bounding box, farthest point at distance 1."""
+    """Return the normalised frame of points: origin in the centre of their box, farthest point at distance 1."""
     center = (points.amin(0) + points.amax(0)) / 2
     return Normalisation(center, float(torch.linalg.vector_norm(points - center, dim=-1).max()))
 
@@ -83,8 +83,8 @@ def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
 def camera_support(seen: PreparedCloud, completion: Completion | None, noise: float, table: float | None) -> Support:
     """Return observations at metric distances that support the fit.
 
-    If the cloud is a view with a `completion`, they include its hidden side and free space. `noise` is that of the
-    distance observed inside, normalised; `table` is the table's height [m].
+    If the cloud is a view with a `completion`, they include its hidden side and free space. `noise` is the
+    standard deviation of the distance observed inside, normalised; `table` is the table's height [m].
     """
     hidden = seen.points[:0] if completion is None else completion.points.to(seen.points)
     surface = torch.cat([seen.points, hidden])
@@ -104,7 +104,7 @@ def camera_support(seen: PreparedCloud, completion: Completion | None, noise: fl
 
 
 def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[Part, ...]:
-    """Return observations of points on the outline and on the hidden side."""
+    """Return observations of points on the outline and on the hidden side, and the errors that they share."""
     outline = completion.outline
     hidden = observe(frame, completion.points, completion.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE)
     tilt = (completion.asymmetry / PART).to(frame.center)  # slope of a field with that deviation and length
@@ -121,7 +121,7 @@ def observe(frame: Normalisation, points: Points, normals: Points, noise: float,
 
 @dataclasses.dataclass(frozen=True)
 class Middle(Value):
-    """Points in the middle of a vessel's wall and its thickness, normalised; the wall is thicker unless `side`."""
+    """Points `x` in the middle of a vessel's wall, and its thickness, normalised; off the `side` it may be thicker."""
 
     x: Points
     side: Bool[Tensor, "n"]
@@ -131,9 +131,10 @@ class Middle(Value):
 def vessel_supports(
     cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float, noise: float
 ) -> tuple[Support, Support, Middle]:
-    """Return observations of a vessel's outer and inner surface besides the seen points, and points amid the wall.
+    """Return additional observations of a vessel's outer and inner surface, and points in the middle of its wall.
 
-    `noise` is that of an anchor's distance, normalised. Distances of the inner surface are positive around the axis.
+    `noise` is the standard deviation of the distances observed off the surface, normalised. Distances of the inner
+    surface are positive around the axis.
     """
     device, cloud = cloud.points.device, cloud.to("cpu")
     frame = frame_around(cloud.points)
@@ -236,7 +237,7 @@ def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float
 
 
 def _rays_beside(outline: Silhouette, offset: float) -> Float[Tensor, "k 3"]:
-    """Return 32 camera rays at an offset outside the outline, in the camera's frame at depth 1."""
+    """Return 32 camera rays outside the outline by `offset` at depth 1, as points at depth 1 in the camera's frame."""
     near = (outline.outside - offset).abs() <= 0.75 * outline.cell
     row, column = torch.nonzero(near, as_tuple=True)
     position = outline.corner + outline.cell * torch.stack([column, row], -1).double()

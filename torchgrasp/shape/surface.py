@@ -1,4 +1,4 @@
-"""The estimated surface: the zero level of the mean distance, Eq. (9), as a triangle mesh or a distance field."""
+"""The estimated surface, the zero level of the mean distance, Eq. (9) of the paper, as a mesh or a distance field."""
 
 import dataclasses
 import itertools
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 RESOLUTION = 48  # cells along the domain's diameter
 COARSE, STEEPER = 4, 1.3
-"""Cells along the side of the first blocks of the grid, and a bound on the slope of the mean within a block over
-the slope between its corners: blocks that the zero level cannot reach are not refined."""
+"""Side [cells] of the first blocks of the grid, and the greatest assumed ratio of the mean's slope within a block to
+the slope between its corners. Blocks that the zero level cannot reach are not refined."""
 LEAST_SHARE = 0.02  # least share of the cloud nearest to a sheet of the zero level that is kept
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Surface(Value):
-    """A triangle mesh of the surface [m], wound outward, open at the edge of the domain.
+    """A triangle mesh of the surface [m]; faces are turned outward, and the mesh is open where it leaves the domain.
 
     Normals are unit gradients of the mean; `std_m` [m] is the surface's standard deviation.
 
@@ -58,13 +58,13 @@ class Surface(Value):
 @checked
 @single_threaded
 def extract_surface(shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = RESOLUTION) -> Surface:
-    """Return the zero level of the mean distance, Eq. (9), within the domain, by marching cubes and Newton steps.
+    """Return the surface, where the mean distance is zero (Eq. 9 of the paper), by marching cubes and Newton steps.
 
-    `resolution` is the number of cells along the domain's diameter. Separate pieces near less than 2 % of the cloud are
-    left out.
+    `resolution` is the number of cells along the domain's diameter. Separate pieces are left out if they
+    are nearest to less than 2 % of the cloud.
 
     Raises:
-        BadArgument: a resolution outside [8, 256], or a mean without zero level.
+        BadArgument: a resolution outside [8, 256], or a mean distance that is nowhere zero.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> surface = extract_surface(fit_shape(load_object("jug").view, table=0.0), resolution=24)
@@ -94,7 +94,7 @@ def extract_mesh(shape: ShapeGP) -> Mesh:
 
 
 def _trace_walls(shape: ShapeGP, resolution: int) -> list[tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]]:
-    """Return the vertices (normalised) of each wall, and faces whose indices count the vertices of all walls."""
+    """Return vertices (normalised) and faces of each wall; the indices in faces count the vertices of all walls."""
     walls = [_trace_wall(shape, i, resolution) for i in range(len(shape.walls))]
     before = [0, *itertools.accumulate(len(x) for x, _ in walls)]
     return [(x, faces + n) for (x, faces), n in zip(walls, before, strict=False)]
@@ -135,9 +135,9 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
 
 
 def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
-    """Return the mean distance on a grid from -radius along each axis; NaN outside the ball.
+    """Return the mean distance on a cubic grid that starts at -radius on each axis; NaN outside the ball.
 
-    Only blocks of cells that the zero level may cross are refined; other nodes have the sign of a neighbour.
+    Only blocks of cells that the zero level may cross are refined; other nodes copy the value of a neighbour.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -164,13 +164,13 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
 
 
 def newton_step(value: Float[Tensor, "n"], gradient: Points, longest: float, least_slope: float = 0.0) -> Points:
-    """Return the Newton step along the gradient to the zero level, at most `longest`."""
+    """Return the Newton steps along the gradients to the zero level, each at most `longest` long."""
     step = -value / (gradient * gradient).sum(-1).clamp_min(least_slope)
     return limit_norm(step[:, None] * gradient, longest)
 
 
 def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
-    """Return which faces belong to connected pieces that lie near enough cloud points."""
+    """Return a mask of the faces in connected pieces to which enough points of the cloud are nearest."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree

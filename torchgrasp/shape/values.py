@@ -86,7 +86,7 @@ def off_surface(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: fl
 
 @dataclasses.dataclass(frozen=True)
 class MeanJet(Batch):
-    """The posterior mean distance with first and second derivatives; gradients need not have unit length."""
+    """The posterior mean distance and its derivatives by the normalised point; gradients need not have unit length."""
 
     distance: Float[Tensor, "*b"]
     gradient: Float[Tensor, "*b 3"]
@@ -94,19 +94,19 @@ class MeanJet(Batch):
 
     @property
     def normals(self) -> Float[Tensor, "*b 3"]:
-        """The outward unit normals, Eq. (11)."""
+        """The outward unit normals, Eq. (11) of the paper."""
         return unit(self.gradient)
 
     @property
     def normal_jacobian(self) -> Float[Tensor, "*b 3 3"]:
-        """The derivatives of the normals by the points, (1 - n n^T) H / |g|."""
+        """The derivatives of the normals by the points, (1 - n n^T) H / |g|, with normal n, Hessian H, gradient g."""
         n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
         return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
 
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceJet(MeanJet):
-    """The mean distance to second order, and the variance of the distance to first order."""
+    """The mean distance with first and second derivatives, and its variance with first derivatives."""
 
     variance: Float[Tensor, "*b"]
     variance_gradient: Float[Tensor, "*b 3"]
@@ -142,9 +142,9 @@ Evaluate = Callable[[Tensor], tuple[Tensor, ...]]
 
 
 def pass_gradients(x: Float[Tensor, "*b 3"], evaluate: Evaluate, differentiate: Evaluate) -> tuple[Tensor, ...]:
-    """Return `evaluate(x)`; autograd uses the derivatives (*b, ..., 3) that `differentiate(x)` gives.
+    """Return `evaluate(x)`; autograd uses the derivatives (*b, ..., 3) by x that `differentiate(x)` returns.
 
-    Second derivatives raise an error.
+    Taking second derivatives raises an error.
     """
     if not (x.requires_grad and torch.is_grad_enabled()):
         return evaluate(x)
@@ -153,7 +153,7 @@ def pass_gradients(x: Float[Tensor, "*b 3"], evaluate: Evaluate, differentiate: 
 
 
 class _Known(torch.autograd.Function):
-    """An autograd function with known derivatives by the points."""
+    """An autograd function whose derivatives by the points are given."""
 
     @staticmethod
     def forward(x: Tensor, evaluate: Any, differentiate: Any) -> tuple[Tensor, ...]:

@@ -116,11 +116,11 @@ class Outlines(Value):
 
     @checked(gradients=True)
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return how far [m] points are outside an outline or in front of a visible surface, at most over views."""
+        """Return the worst violation [m] of any view: how far points lie outside the outline or before the surface."""
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
     def hides(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-        """Return a mask of the points that may be on the hidden side: no view excludes them by more than 1 or 2 mm."""
+        """Return a mask of the points that may be on the hidden side: no view excludes them, within a tolerance."""
         return (self.hull_distance(points) < 0.001) & (self.violation(points) < FRONT_MARGIN)
 
 

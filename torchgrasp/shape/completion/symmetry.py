@@ -210,7 +210,7 @@ def _plane_grid(scorer: SymmetryScorer, directions: Directions, count: int = OFF
 
 
 def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: View) -> list[tuple[int, int]]:
-    """Return grid indices of the best planes that differ in direction and can mirror points to where none are seen."""
+    """Return (direction, offset) in the grid of the best planes that differ in direction and may have hidden images."""
     best, offset = scores.max(1)
     hides = _hides(directions, across)
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if hides[i]]
@@ -243,7 +243,7 @@ def _across_plane(scorer: SymmetryScorer, planes: list[Mirror], grid: Float[Tens
 
 
 def _square_plane(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror, across: View) -> Mirrors:
-    """Return, as a row, the best vertical plane perpendicular to `best` if it can hide images and no plane is near."""
+    """Return, as a row, the best vertical plane perpendicular to `best`, if its images can be hidden and it is new."""
     direction = torch.stack([-best[1], best[0], torch.zeros_like(best[0])])[None]
     near = any(abs(float(plane[:3] @ direction[0])) > 0.42 for plane in planes)
     if near or not bool(_hides(direction, across)):

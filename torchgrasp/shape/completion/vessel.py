@@ -161,7 +161,7 @@ def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
 
 
 def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float, int], ...]) -> HiddenWall:
-    """Return points at one height, normals up, on rings about the axis; ring: (share of `radius`, number of points)."""
+    """Return points at one height, normals up, on rings about the axis: each (share of `radius`, number of points)."""
     places = []
     for share, count in rings:
         angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
