@@ -33,7 +33,7 @@ DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)  # dtypes in ou
 
 
 class Field(NamedTuple):
-    """A value in a JSON or TOML file, with its path and place in the file; `refuse` makes the error for a bad value."""
+    """A value in a JSON or TOML file, with the file's `path` and the `place` in it; `refuse` makes errors about it."""
 
     path: Path
     place: str
@@ -50,7 +50,7 @@ class Field(NamedTuple):
         return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
 
     def entries(self, *required: str) -> "dict[str, Field]":
-        """Return the fields of a JSON object by name, those that are `required` among them."""
+        """Return the fields of a JSON object by name; raise an error if it lacks one of the `required` names."""
         if not isinstance(self.value, dict):
             raise self.wrong("an object { }")
         if missing := [name for name in required if name not in self.value]:
@@ -59,7 +59,7 @@ class Field(NamedTuple):
         return {key: Field(self.path, f"{within}{key}", value, self.refuse) for key, value in self.value.items()}
 
     def items(self, most: int = 1000) -> "list[Field]":
-        """Return the fields of a list of at most `most` items."""
+        """Return the items of a list as fields; raise an error if there are more than `most`."""
         if not isinstance(self.value, list) or len(self.value) > most:
             raise self.wrong(f"a list of at most {most}")
         return [Field(self.path, f"{self.place}[{i}]", x, self.refuse) for i, x in enumerate(self.value)]
@@ -91,7 +91,7 @@ class Field(NamedTuple):
 
 
 def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) -> Field:
-    """Read a JSON file in UTF-8 of at most `most` bytes, without NaN; raise the error of `refuse` for other files."""
+    """Read a JSON file (UTF-8, at most `most` bytes, no NaN) as a field; raise the error of `refuse` for others."""
     data = read_bounded(path, most, allowed, refuse)
     try:
         value = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
@@ -106,13 +106,13 @@ def _refuse_constant(name: str) -> float:
 
 
 def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
-    """Write tensors and metadata as one safetensors file of a `kind`; raise `OutputError` if this fails."""
+    """Write tensors and metadata to a safetensors file that names its `kind`; raise `OutputError` if this fails."""
     # as bytes, since a full disk then is an OSError, which save_file makes an error of its own
     return write_file(path, pack_tensors(kind, tensors, meta))
 
 
 def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> bytes:
-    """Return the bytes of a safetensors file of a `kind`; equal tensors and metadata give equal bytes."""
+    """Return the bytes of a safetensors file that names its `kind`; equal tensors and metadata give equal bytes."""
     contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}  # a file shares no memory
     # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
     header = {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)}
@@ -122,7 +122,10 @@ def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) ->
 def load_tensors(
     path: Path | str, kind: str, names: set[str], optional: Collection[str] = ()
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a safetensors file with tensors `names` and any of `optional`; raise `ModelFileError` for other files."""
+    """Read tensors by name and the metadata from a safetensors file of a `kind`.
+
+    The file must hold the tensors `names`, and may hold those in `optional`; other files raise `ModelFileError`.
+    """
     allowed = names.union(optional)
     refuse = functools.partial(ModelFileError, "path")
     check_file(path, TENSOR_FILE_BYTES, f"a safetensors file of kind {kind!r}", refuse)
@@ -153,7 +156,7 @@ def load_tensors(
 def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) -> tuple[SomeValue, dict[str, str]]:
     """Read a value and metadata from a safetensors file of a `kind`; raise `ModelFileError` for other shapes or types.
 
-    The annotations of the fields name the tensors. `rest` gives the other fields, unless they keep their defaults.
+    The tensors have the names of the fields of class `of`. `rest` gives its other fields; they may keep their defaults.
     """
     fields = _tensor_fields(of)
     optional = {name for name, kinds in fields.items() if type(None) in kinds}
@@ -167,7 +170,7 @@ def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) ->
 
 
 def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ...]]:
-    """Return the annotations of all tensors in a value class by dotted name; optional tensors include NoneType."""
+    """Return the allowed types of all tensors in a value class by dotted name; for an optional one also NoneType."""
     fields: dict[str, tuple[Any, ...]] = {}
     for name, hint in _hints(of).items():
         kinds = typing.get_args(hint) if typing.get_origin(hint) not in (None, dict) else (hint,)
@@ -179,7 +182,7 @@ def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ..
 
 
 def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: dict[str, Any]) -> SomeValue:
-    """Return a value built from tensors by dotted name; a missing tensor becomes None."""
+    """Return a value of class `of` built from tensors by dotted name; a missing tensor becomes None."""
     values = {name: tensors.get(prefix + name) for name in _tensor_fields(of) if "." not in name} | rest
     nested = {name: hint for name, hint in _hints(of).items() if _is_value(hint)}
     return of(**values, **{name: _build(hint, tensors, f"{prefix}{name}.", {}) for name, hint in nested.items()})
@@ -195,7 +198,7 @@ def _is_value(hint: Any) -> bool:
 
 
 class Recent(Generic[Item]):
-    """A cache of the last few items read, by number; a copy in another process starts empty."""
+    """A cache of the last few items that were read, each with a number; a copy in another process starts empty."""
 
     def __init__(self, most: int) -> None:
         self.most = most

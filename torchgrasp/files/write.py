@@ -23,7 +23,9 @@ LOCK = ".lock"  # name of the lock file in a folder. It holds the process and ho
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
-    """Write a file atomically, text as UTF-8, or by a function that gets a file object; its folder is created.
+    """Write text (as UTF-8), bytes, or the output of a function to a file atomically; return its path.
+
+    The function gets a file object. A missing folder is created.
 
     Raises:
         OutputError: the folder cannot be written, or the disk is full. Nothing half-written is left.
@@ -70,13 +72,13 @@ def is_file(path: Path | str) -> bool:
 
 
 def read_bytes(path: Path | str) -> bytes:
-    """Return the content of a file, at most as many bytes as its reported size: some system files never end."""
+    """Return the content of a file, cut at its reported size, because some system files never end."""
     with Path(path).open("rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> bytes:
-    """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for others."""
+    """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for other files."""
     check_file(path, most, allowed, refuse)
     try:
         return read_bytes(path)
@@ -85,7 +87,7 @@ def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> b
 
 
 def check_file(path: Path | str, most: int, allowed: str, refuse: Refuse) -> None:
-    """Raise the error of `refuse` unless a path is a regular file, which ends, of at most `most` bytes."""
+    """Raise the error of `refuse` unless a path is a regular file of at most `most` bytes."""
     if not is_file(path):
         raise refuse(f"{path}, which is no file", allowed)
     if (size := Path(path).stat().st_size) > most:
@@ -114,7 +116,7 @@ def _plain(value: Any) -> Any:
 
 
 def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) -> str:
-    """Return rows of cells as aligned lines of text; columns are right-aligned except those in `left`."""
+    """Return rows of cells as aligned lines of text; columns are right-aligned except the indices in `left`."""
     longest = [max(map(len, column)) for column in zip(*rows, strict=True)]
     widths = [-width if k in left else width for k, width in enumerate(longest)]
     return "\n".join(format_line(row, widths) for row in rows)
@@ -128,7 +130,7 @@ def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Create a folder and lock it against other runs; remove what an interrupted run left half-written.
+    """Create a folder and lock it against other runs within the context; remove half-written files of an earlier run.
 
     Raises:
         OutputError: another run holds the lock, or the folder cannot be written.
@@ -140,14 +142,14 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[None]:
-    """Lock a file by a lock file beside it, and clean up, as `hold_folder` does for a folder."""
+    """Lock a file against other runs within the context, by a lock file beside it; remove half-written copies."""
     with _hold("path", path, path.with_name(f".{path.name}{LOCK}")):
         _remove_parts(x for x in path.parent.glob(f".*{ENDING}") if x.name.startswith(f".{path.name}."))
         yield
 
 
 def begin_folder(path: Path, content: str, what: str) -> None:
-    """Write the file that describes a locked folder; raise `OutputError` if the folder holds other `what` or files."""
+    """Write a file that describes its folder; raise `OutputError` if the folder holds other files or other content."""
     folder = path.parent
     if path.exists():
         if path.read_text("utf-8", errors="replace") != content:
@@ -167,7 +169,7 @@ def temporary_folder() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _hold(argument: str, what: Path, path: Path) -> Iterator[None]:
-    """Lock a folder or a file by means of a lock file at `path`."""
+    """Lock a folder or a file within the context, by a lock file at `path`."""
     folder = path.parent
     made = [x for x in (folder, *folder.parents) if not x.exists()]
     lock = FileLock(path, timeout=0)
@@ -195,7 +197,7 @@ def _hold(argument: str, what: Path, path: Path) -> Iterator[None]:
 
 
 def _holder(path: Path) -> str:
-    """Return which run holds a lock, as written in its lock file."""
+    """Return the process and host of the run that holds a lock, as its lock file states them."""
     try:
         return path.read_text(encoding="utf-8")[:200].strip() or "another run"
     except (OSError, UnicodeDecodeError):

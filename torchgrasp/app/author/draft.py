@@ -44,7 +44,7 @@ class Draft(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """The user's choices for a new hand: links of the fingertips, name, root link below an arm, folder of meshes.
+    """The user's choices for a new hand: fingertip links, name, first link of the hand on an arm, folder of meshes.
 
     >>> Wish(tips=("thumb_tip", "index_tip", "ring_tip"), name="mine").root
     ''
@@ -63,7 +63,7 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     Args:
         path: the URDF.
         tips: links of the fingertips in grasp order, first the three of option "default"; "four" and "five" add the
-            next tips. By default the ends of the branches, in the order in which their pads best face each other.
+            next tips. By default the last links of the branches, in the order in which their pads best face each other.
         name: name of the hand; by default the name of the robot.
         seed: random seed.
 
@@ -135,14 +135,14 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
 
 
 def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4 _ n"]:
-    """Return the frames of some links in random postures, computed in chunks to bound the memory."""
+    """Return the poses (3 x 4) of some links in random postures, computed in chunks to bound the memory."""
     tree, at = tree_from_urdf(urdf), [[x.name for x in urdf.links].index(link) for link in links]
     values = draw_postures(urdf, _coupling(urdf), 20_000, seed)
     return torch.cat([tree.frames(part)[:, :, at] for part in values.split(1000, 1)], -1)
 
 
 def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the fingertip links, given or found; raise `BadArgument` for a wrong number, or unusable links."""
+    """Return the given fingertip links, else those found; raise `BadArgument` if their number or a link is unusable."""
     ends = fingertip_links(urdf)
     chosen = tips or ends
     if not FINGERTIPS[0] <= len(chosen) <= FINGERTIPS[1] or len(set(chosen)) < len(chosen):
@@ -181,7 +181,7 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
 def _toml_text(
     urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]], approach: Triple, names: tuple[str, str], seed: int
 ) -> str:
-    """Return the text of a hand.toml; `pads` are by link, `sets` by option; `names` are of hand and URDF file."""
+    """Return the text of a hand.toml from pads by tip, sets of tips by option, and the names of hand and URDF file."""
     import jinja2
 
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
@@ -208,7 +208,7 @@ def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
 
 
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
-    """Return the last link with a collision shape on every branch that joints move."""
+    """Return the fingertip links: the last link with a collision shape on every branch that joints move."""
     parents, shaped = {j.parent for j in urdf.joints}, {x.name for x in urdf.links if x.shapes}
     ends = []
     for link in (x.name for x in urdf.links if x.name not in parents):

@@ -33,7 +33,7 @@ Corners = tuple[np.ndarray, np.ndarray]
 
 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
-    """Return the path of a mesh in `folder`, also for `package://`; raise `HandFileError` for all other files."""
+    """Return the path of a mesh that a URDF names, also by `package://`; raise `HandFileError` if `folder` lacks it."""
     base, kinds = folder.resolve(), ", ".join(MESH_KINDS)
     refusal = urdf.wrong(f"mesh {name[:80]!r}", f"a mesh ({kinds}) of at most {MESH_BYTES >> 20} MiB inside {folder}")
     package = name.startswith("package://")
@@ -76,7 +76,7 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 
 
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
-    """Replace every mesh by a few boxes or a cylinder around its points; report the numbers."""
+    """Replace every mesh by a few boxes or a cylinder around its points; also return a sentence with the numbers."""
     links, count, made = [], 0, 0
     for link in urdf.links:
         shapes: list[Shape] = []
@@ -90,7 +90,7 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
 
 
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
-    """Replace a tip by a ball at its end, in direction `outward`, and boxes up to the ball unless the tip is short."""
+    """Replace the shapes of a tip by a ball at its end, towards `outward`, and on a long tip boxes up to the ball."""
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
     shapes = [Shape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]
@@ -158,7 +158,7 @@ def fit_shapes(points: Points) -> list[Shape]:
 
 
 def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
-    """Return the axes of the boxes as columns: those of the link, unless rotated axes fit much better."""
+    """Return the axes of the fitted boxes as columns: the axes of the link, unless rotated axes fit much better."""
     turned_share = 0.85  # a box is turned out of the link's axes if its volume falls below this share
     from trimesh.bounds import oriented_bounds
 
@@ -170,12 +170,12 @@ def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
 
 
 def _boxes(corners: list[Corners], axes: np.ndarray) -> list[Shape]:
-    """Return boxes from their lower and upper corners along `axes` (columns)."""
+    """Return boxes as shapes, from their lower and upper corners along `axes` (columns)."""
     return [_shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners]
 
 
 def _cut(points: Points, most: int, saving: float) -> list[Corners]:
-    """Return the lower and upper corners of at most `most` boxes that cover the points."""
+    """Return lower and upper corners of at most `most` boxes that cover the points; a cut must save `saving`."""
     cells = [(points.min(0), points.max(0), points)]
     while len(cells) < most:
         total = sum(float(np.prod(high - low)) for low, high, _ in cells)
@@ -188,7 +188,7 @@ def _cut(points: Points, most: int, saving: float) -> list[Corners]:
 
 
 def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[float, list]]:
-    """Return each way to cut a box in two: the saved volume, and both boxes, none shorter than 8 mm."""
+    """Return for each way to cut a box in two the saved volume and both boxes; no side is shorter than 8 mm."""
     found = []
     for axis in range(3):
         for at in np.linspace(low[axis], high[axis], 12)[1:-1]:

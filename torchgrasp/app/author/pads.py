@@ -22,7 +22,7 @@ from torchgrasp.hand.kinematics import map_directions, map_points, pose_in_carri
 from torchgrasp.hand.urdf import Joint, Link, Shape, Triple, Urdf
 
 TILT = math.radians(30)
-"""Angle [rad] between the direction of motion and the contact of a round tip, towards the finger's end."""
+"""Angle [rad] by which the contact of a round tip is turned from the direction of motion to the finger's end."""
 SHORT_ARM = 1e-3  # a joint whose axis passes a tip nearer than this [m] does not move it
 BESIDE = 0.003  # distance [m] from a ray or a plane within which points of a surface count
 
@@ -31,7 +31,7 @@ Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 
 
 class Guess(NamedTuple):
-    """Guessed fingertip pads, direction to each finger's end in its tip's frame, and direction out of the palm."""
+    """Guessed fingertip pads, the direction to each finger's end in its tip's frame, and that out of the palm."""
 
     pads: tuple[Pad, ...]
     outward: tuple[Vector, ...]
@@ -41,7 +41,10 @@ class Guess(NamedTuple):
 def guess_pads(
     urdf: Urdf, frames: Float[Tensor, "3 4 _ n"], tips: Sequence[str], surfaces: Mapping[str, Points]
 ) -> Guess:
-    """Guess pads and the direction out of the palm; `frames` are of tips and palm, `surfaces` the points on links."""
+    """Guess the pads of the fingertips and the direction out of the palm from random postures.
+
+    `frames` are the poses of the tips and then the palm, `surfaces` the points [m] on each link in its frame.
+    """
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
     tip_frames = frames[:, :, :-1]
@@ -75,12 +78,12 @@ def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
 
 
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
-    """Return the order of the tips: the three whose pads face each other in most postures, then the next best ones."""
+    """Return the tips in order, as indices: three whose pads face each other in most postures, then the next best."""
     contacts, normals = (torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal"))
     points, directions = map_points(frames, contacts), map_directions(frames, normals)
 
     def share(tips: tuple[int, ...]) -> float:
-        """Return the fraction of the postures in which all these pads face their middle."""
+        """Return the fraction of the postures in which all these pads face the centroid of their contacts."""
         inward = points[:, tips].mean(1, keepdim=True) - points[:, tips]
         length = torch.linalg.vector_norm(inward, dim=0)
         facing = (directions[:, tips] * inward).sum(0) / length.clamp_min(1e-9)
@@ -118,7 +121,7 @@ def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
 
 
 def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
-    """Return the last joint that moves a tip, the tip's motion in its frame, and the direction from the joint to it."""
+    """Return the last joint that moves a tip, and in the tip's frame its motion and the direction from joint to tip."""
     tip_from_above = np.eye(4)
     for joint in urdf.joints_above(tip):
         if joint.kind != "fixed":
@@ -147,7 +150,7 @@ def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
 
 
 def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
-    """Return the pad of a tip with a simple shape: on the side towards its motion; on a sphere tilted to the end."""
+    """Return the pad of a tip that is one simple shape, on the side of its motion; on a sphere nearer to its end."""
     if shape.kind == "sphere":
         normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]
         center, normal = np.array(shape.xyz), normal / np.linalg.norm(normal)

@@ -38,7 +38,7 @@ def place(pose: np.ndarray) -> tuple[Triple, Triple]:
 
 
 def keep_below(urdf: Urdf, root: str) -> Step:
-    """Keep only a link and the links below it, such as the hand on an arm."""
+    """Keep only the link `root` and the links below it, such as the hand on an arm."""
     names = {x.name for x in urdf.links}
     if root not in names:
         raise BadArgument("root", repr(root), f"a link of {urdf.path}: {sorted(names)}")
@@ -56,7 +56,10 @@ def keep_below(urdf: Urdf, root: str) -> Step:
 
 
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
-    """Merge massless frames, but last links with shapes, into the links to which they are fixed; also return which."""
+    """Merge massless links into the links to which they are fixed; last links of a branch with shapes are kept.
+
+    Also return the sentences, and by the name of each merged link the link that now holds it.
+    """
     taken: dict[str, str] = {}
     while True:
         links, parents = {x.name: x for x in urdf.links}, {j.parent for j in urdf.joints}
@@ -88,7 +91,7 @@ def _under(joint: Joint, above: Joint) -> Joint:
 
 
 def _moved(link: Link, pose: np.ndarray) -> Link:
-    """Return a link with mass, inertia and shapes in another frame."""
+    """Return a link with its mass centre, inertia and shapes in another frame; `pose` maps the link's frame to it."""
     turn, shapes = pose[:3, :3], []
     for shape in link.shapes:
         xyz, rpy = place(pose @ pose_of(shape))
@@ -99,7 +102,7 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
 
 
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
-    """Fix the wrist joints, which move all fingertips; if there are more than three of them, cut off the arm."""
+    """Fix the wrist joints, which move all fingertips; more than three such joints are an arm, which is cut off."""
     common = [j for j in urdf.movers(tips[0]) if all(j in urdf.movers(tip) for tip in tips)] if len(tips) > 2 else []
     if len(common) > 3:
         urdf, done = keep_below(urdf, common[0].child)
@@ -143,7 +146,7 @@ def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 
 
 def _add_drives(joints: dict[str, Joint]) -> list[str]:
-    """Give joints without effort or velocity typical values of small hands."""
+    """Give joints without an effort or velocity limit the typical values of small hands."""
     idle = [j for j in joints.values() if j.kind != "fixed" and not (j.effort > 0 and j.velocity > 0)]
     for j in idle:
         effort, velocity = (x if x > 0 else usual for x, usual in ((j.effort, EFFORT), (j.velocity, VELOCITY)))

@@ -63,7 +63,7 @@ START = """torchgrasp: dexterous fingertip grasps from a partial point cloud
   torchgrasp grasp CLOUD --hand allegro --out DIR
 
 All commands: torchgrasp --help. To read: README.md and docs/ of the repository."""
-"""What `torchgrasp` alone prints."""
+"""The text that `torchgrasp` prints when it is called without arguments."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run_and_exit() -> NoReturn:
     """Run the command line of this process, and end the process.
 
-    The first SIGINT or SIGTERM ends the command in order. Later signals are ignored, so that the command can clean up.
+    The first SIGINT or SIGTERM ends the command cleanly. Later signals are ignored, so that the command can clean up.
 
     >>> import subprocess
     >>> code = "from torchgrasp.app.cli import run_and_exit; run_and_exit()"
@@ -187,7 +187,7 @@ def _sentence(error: GraspError) -> str:
 
 @contextlib.contextmanager
 def _open_streams() -> Iterator[None]:
-    """Replace missing standard streams by the null device, or the next open file would get their descriptors."""
+    """Replace missing standard streams by the null device, so that no other file gets their descriptors."""
     with contextlib.ExitStack() as stack:
         if None in (sys.stdin, sys.stdout, sys.stderr):
             while (free := os.open(os.devnull, os.O_RDWR)) <= 2:  # descriptors of the standard streams
@@ -208,7 +208,7 @@ def _drop_stdout() -> None:
 
 
 class _WithoutMarkup:
-    """An output stream that removes tyro's markup from the text, where tyro prints it literally."""
+    """An output stream that removes markup such as [bold] from the text, where tyro would print it literally."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream

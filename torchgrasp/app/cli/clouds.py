@@ -65,7 +65,7 @@ class CloudCheck(Command):
 
 
 def _no_view(cloud: PointCloud) -> BadArgument | None:
-    """Return the error for a cloud that no single camera can see, which `fit_shape` rejects, or None."""
+    """Return the error of `fit_shape` for a cloud that no single camera can see, or None if one camera can see it."""
     some = cloud.select(draw_rows(len(cloud), 20_000))  # more points give no more certainty
     try:
         seen = prepare_cloud(some, torch.Generator().manual_seed(0))
@@ -78,7 +78,7 @@ def _no_view(cloud: PointCloud) -> BadArgument | None:
 
 @arguments(points="cloud", path="out")
 class CloudCut(Command):
-    """Write the points of one object in a scene without the table, and beside them where the table is."""
+    """Write the points of one object in a scene, without the points of the table, and the plane of the table."""
 
     cloud: Path = positional("point cloud of a scene of any size (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv)")
     out: Path = required(OUT_CLOUD_HELP)

@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class Command:
-    """Base of all commands; `names` maps the argument names in the library's errors to the command's fields."""
+    """Base of all commands; `names` maps the names of arguments in the library's errors to fields of the command."""
 
     names: ClassVar[dict[str, str]] = {}
 
@@ -49,7 +49,7 @@ def nested(default: Any) -> Any:
 
 
 def arguments(**names: str) -> Callable[[type[T]], type[T]]:
-    """Return a decorator of a command's class; `names` maps the argument names in the library's errors to fields."""
+    """Return a decorator of a command's class; `names` maps arguments in the library's errors to its fields."""
 
     def make(cls: type[T]) -> type[T]:
         made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
@@ -127,7 +127,7 @@ class Progress:
         self.bar = make_bar(len(names), "stage", desc=names[0], delay=1)
 
     def end(self, name: str, message: str, value: Any = None) -> None:
-        """Print the line of a finished stage."""
+        """Print a line for the stage `name` that has ended, and keep its `value`; the bar shows the next stage."""
         now = time.perf_counter()
         self.stages.append((name, message, now - self.began))
         self.values[name] = value

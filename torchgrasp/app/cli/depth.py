@@ -1,4 +1,4 @@
-"""`torchgrasp cloud depth` and `torchgrasp cloud scene`: a cloud or a scene from a depth image, a scene of a cloud."""
+"""The commands `torchgrasp cloud depth` and `cloud scene`: a cloud or a scene from a depth image, or from a cloud."""
 
 import dataclasses
 from pathlib import Path
@@ -98,7 +98,7 @@ class CloudDepth(_DepthCommand):
 
 @arguments(labels="mask", cloud="depth")
 class CloudScene(_DepthCommand):
-    """Write the scene of a depth image or a cloud for `torchgrasp grasp`: table and objects; and its picture.
+    """Write a scene with table and objects from a depth image or a cloud for `torchgrasp grasp`; draw its picture.
 
     See docs/real_camera.md.
     """
@@ -137,7 +137,7 @@ class CloudScene(_DepthCommand):
         return 0
 
     def _of_image(self) -> Scene:
-        """Return the scene of a depth image."""
+        """Read the depth image of the command and return its scene."""
         if self.viewpoint is not None or self.unit != "m":
             raise BadArgument("--intrinsics", "--viewpoint or --unit beside it", "--camera-pose or --depth-unit")
         depth, camera, mask, pose = self.images()
@@ -147,7 +147,7 @@ class CloudScene(_DepthCommand):
         return Scene.from_depth(depth, camera, pose, **given, up=self.vertical)
 
     def _of_cloud(self) -> Scene:
-        """Return the scene of a cloud."""
+        """Read the cloud of the command and return its scene."""
         if self.depth.suffix.lower() in (".png", ".tif", ".tiff", ".exr") or is_scene(self.depth):
             raise BadArgument("--intrinsics", "none", "fx fy cx cy of the depth image, or a file")
         for name, given in (("mask", self.mask), ("frames", self.frames), ("depth-unit", self.depth_unit)):

@@ -19,7 +19,7 @@ from torchgrasp.hand.load import hands_folder
 from torchgrasp.specs import Simulator
 
 CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", "safetensors")
-"""Packages without which nothing runs."""
+"""Packages that every command needs."""
 SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}  # simulators, and the extra that installs each
 
 

@@ -43,7 +43,7 @@ class _Trials(Command):
     seed: Seed = option(0, SEED_HELP)
 
     def trial(self, **changes: Any) -> dict[str, Any]:
-        """Return the changes to a protocol's trial that the user asked for."""
+        """Return the options of the simulated trial that the user set, by name; `changes` are further options."""
         changes |= {"closing": self.closing, "simulator": self.simulator}
         return {name: value for name, value in changes.items() if value is not None}
 
@@ -52,7 +52,7 @@ class _Trials(Command):
 class Evaluate(_Trials):
     """Plan on each noisy view of a folder's objects, and test the best grasps in simulation.
 
-    Prints a line for each view, then shares with 95 % intervals over families of objects. Writes evaluate.json,
+    Prints a line for each view, then success rates with 95 % intervals over families of objects. Writes evaluate.json,
     evaluate.html, and a folder of grasps.
     """
 
@@ -99,7 +99,7 @@ class Evaluate(_Trials):
 
 
 def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
-    """Return pairs of object and view for all views; an object without views has the view ""."""
+    """Return pairs of object name and view name for all views; an object without views has the view name ""."""
     names = []
     for name, entry in read_entries(objects, spec.only).items():
         bad = isinstance(entry, DatasetError)  # a bad entry is refused when it is evaluated
@@ -109,7 +109,7 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
 
 
 def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
-    """Print one line for a view; `widths` are the column widths of object and view."""
+    """Print one line with the result of a view; `widths` are the column widths of the names of object and view."""
     failed = [attempt.status for attempt in score.attempts if attempt.status is not Status.OK]
     reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
@@ -119,7 +119,7 @@ def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
 
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
-    """Print success rates, also for each group of objects, failures by stage, and the figures of the report."""
+    """Print the success rates of all objects and of each group, failures by stage, and further means and times."""
     rows = [(text, format_share(summary[key])) for key, text in SHARE_NAMES.items()]
     for name, group in summary["by_group"].items():
         rows += [(f"{name}: {text}", format_share(group[key])) for key, text in SHARE_NAMES.items()]
@@ -132,12 +132,12 @@ def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
 
 @arguments()
 class Campaign(_Trials):
-    """Write a data set: for each view its cloud, grasps, certificates, predicted and simulated success.
+    """Write a data set: for each view its cloud, grasps, proofs of closure, predicted and simulated success.
 
     Prints a line for each job, one object and view. Writes shards of safetensors with README.md and card.json, which
     torchgrasp.data.read_shards reads. The same command continues a run that was interrupted or killed, and tries
-    failed jobs again: worker_died, timed_out, and broken, an error of the library. The exit code is 1 while some are
-    left.
+    failed jobs again: worker_died, timed_out, and broken, an error of the library. The exit code is 1 while failed jobs
+    are left.
     """
 
     objects: Path = positional(OBJECTS_HELP)
@@ -179,7 +179,7 @@ class Campaign(_Trials):
 
 
 def print_job(row: JobRow) -> None:
-    """Print one line for a finished job."""
+    """Print one line for a finished job, which is one view of one object."""
     reason = "" if row.status is Status.OK else row.note or row.status.sentence
     numbers = row.executable, f"{row.passed}/{row.grasps}"
     print(format_line((row.object, row.view, *numbers, reason), (-12, -6, 5, 7, -1)), flush=True)

@@ -27,7 +27,7 @@ TEXTS: dict[str, Callable[..., str]] = {
     "moveit": formats.format_moveit,
     "ros2": formats.format_trajectories,
 }
-"""Formats of one text file without the name of the object."""
+"""Writers of formats that are one text file and do not name the object."""
 
 
 @arguments(path="out", folder="out", object_path="object", name="hand", fingers="grasps")
@@ -114,7 +114,7 @@ class Import(Command):
         return 0 if closed else 1
 
     def _read(self, hand: Hand, quaternion: Quaternion, unit: Unit) -> Grasps:
-        """Read the grasps and certify them."""
+        """Read the grasps in a given quaternion order and unit, and certify their contacts."""
         with naming(path="FILE"):
             joints, poses, opened = formats.read_foreign(self.file, hand, self.joints, quaternion)
         poses[:, :3, 3] *= {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit]

@@ -58,12 +58,12 @@ Among = Literal["auto"] | None
 
 @arguments(points="cloud", normals="cloud", path="out", target="label")
 class Grasp(Command):
-    """Plan grasps of the object in a partial cloud, and close on it in simulation; or of an object in a scene.
+    """Plan grasps of an object in a partial cloud or a scene; with a mesh, also close the hand in simulation.
 
     Writes grasps.safetensors, report.html and the 3D page view.html into the output folder. If no grasp is executable,
-    single changes are tried, and the change that helps most is named. The cloud is checked as by `cloud check`. Refused
-    are a camera below the table, a camera that the points contradict, a plane left in, two bodies and another unit.
-    Other findings are printed as advice.
+    single changes are tried, and the change that helps most is named. The cloud is checked as by `cloud check`. It is
+    refused if the camera is below the table or contradicts the points, if a plane is left in, if there are two bodies,
+    or if the unit is wrong. Other findings are printed as advice.
     """
 
     cloud: Path = positional(
@@ -161,7 +161,7 @@ class Grasp(Command):
         return 0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
 
     def _true_mesh(self, path: Path) -> Path | None:
-        """Return the path of the true mesh for the simulated closing, or None if no closing is simulated."""
+        """Return the path of the true mesh, or None if there is none; raise `BadArgument` if --close has no mesh."""
         shipped = path != self.cloud  # the cloud is given by name
         mesh = path.with_name("mesh.ply") if shipped and self.close and self.mesh is None else self.mesh
         if self.close:
@@ -171,7 +171,7 @@ class Grasp(Command):
         return mesh
 
     def _grasp_scene(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
-        """Plan for the chosen object of a scene, or the easiest, and write the results; return the exit code."""
+        """Plan for the chosen object of a scene, or the easiest object, and write the results; return the exit code."""
         spec, choice = ContactSpec(friction=self.friction), self.point if self.label is None else self.label
         names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
         with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
@@ -205,7 +205,7 @@ class Grasp(Command):
         return 0 if print_grasps(run) else 1
 
     def _with_table(self, scene: Scene, chosen: bool) -> Scene:
-        """Return a scene on the table of --table or --up; a target that is lost needs another one to be chosen."""
+        """Return the scene with the table of --table or --up; raise `BadArgument` if the target is then lost."""
         if (self.view.table is None and self.view.up is None) or scene.table is None:
             return scene
         image, name = scene.image, "--up" if self.view.table is None else "--table"
@@ -226,7 +226,7 @@ class Grasp(Command):
         return again
 
     def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):
-        """Plan for the objects of a scene until one is easy; return the scene with this target, grasps and shape."""
+        """Plan for the objects of a scene until one is easy; return the scene with it as target, grasps and shape."""
         # An object with this predicted success is easy enough: the others are not tried.
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9)
         for thing in plan.things:

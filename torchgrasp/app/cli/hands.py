@@ -83,7 +83,7 @@ class HandNew(Command):
 
 @arguments(path="out")
 class HandCheck(Command):
-    """Name every fault of a hand; describe and draw a sound hand, and plan on a shipped object."""
+    """List every fault of a hand; if there is none, describe and draw the hand, and plan on a shipped object."""
 
     hand: str = positional(HAND_HELP)
     fingers: str = option(
@@ -176,7 +176,7 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
 
 
 def _try_objects(hand: Hand, bar: tqdm) -> bool:
-    """Plan on the shipped objects until one is graspable; return whether any is."""
+    """Plan on shipped objects until one has an executable grasp; return whether any object has one."""
     for name in ("cylinder", "jug"):
         grasps = plan_grasps(load_object(name).view, hand, starts=TRIAL_STARTS)
         count = count_status(grasps.status)
@@ -218,7 +218,7 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
 
 @arguments(folder="out", path="out")
 class HandSample(Command):
-    """Write random postures without self-collision, with their codes; continue an unfinished folder."""
+    """Write random postures without self-collision, with their fingertip codes; continue an unfinished folder."""
 
     hand: str = required(HAND_HELP)
     out: Path = required("folder to write")

@@ -67,7 +67,7 @@ class ViewOptions:
         return unit(vector)
 
     def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
-        """Read the cloud of an argument `name`; `whole` accepts scenes of any size and keeps all points."""
+        """Read the cloud file of the argument `name`; `whole` accepts scenes of any size and keeps all points."""
         if self.viewpoint is not None and (self.no_viewpoint or self.camera_pose is not None):
             raise BadArgument("--viewpoint", "--no-viewpoint or --camera-pose beside it", "one of them")
         with naming(path=name, points=name, normals=name, viewpoint="--viewpoint"):
@@ -103,14 +103,14 @@ class CloudOptions(ViewOptions):
     no_table: bool = option(False, "there is no table")
 
     def with_table_of(self, file: CloudFile) -> "CloudOptions":
-        """Return the options with the table that a file holds, unless the user gave one or none."""
+        """Return the options with the table that a file holds, unless the user gave --table or --no-table."""
         if file.table is None or self.table is not None or self.no_table:
             return self
         known: Any = {**vars(self), "table": (*file.table.normal.tolist(), file.table.offset)}
         return CloudOptions(**known)
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
-        """Return the table as a plane, as a height [m] along z, or None."""
+        """Return the table as a plane or a height [m] along z, by default at the lowest point; None means no table."""
         table = self.table
         if table is not None and self.no_table:
             raise BadArgument("--table", f"{' '.join(f'{x:g}' for x in table)} and --no-table", "one of the two")
@@ -125,7 +125,7 @@ class CloudOptions(ViewOptions):
         return given if up is None else Plane(up, given)
 
     def given_vertical(self, plane: Plane | None) -> Tensor | None:
-        """Return the vertical of --up or of --table, or None if neither is given."""
+        """Return the unit vector of --up, else the normal of --table, or None if neither is given."""
         return self.vertical if self.up is not None or self.table is None or plane is None else plane.normal
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
@@ -141,7 +141,7 @@ class CloudOptions(ViewOptions):
 
 
 def read_table(table: tuple[float, ...]) -> Plane | float:
-    """Return the plane of --table, or its height [m]."""
+    """Return the table as a plane from four numbers, or as a height [m] from one number."""
     if len(table) not in (1, 4):
         raise BadArgument("--table", f"{len(table)} numbers", "a height, or four: a normal and its distance")
     numbers = check_tensor("--table", torch.tensor(table, dtype=torch.float64), (len(table),))
@@ -154,7 +154,7 @@ def read_table(table: tuple[float, ...]) -> Plane | float:
 
 
 def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
-    """Return a cloud moved from the camera's frame to the frame of the pose."""
+    """Return a cloud moved from the camera's frame to the pose's frame; raise `BadArgument` if it is in another."""
     widest = 1.5  # tangent of half an angle of view wider than that of depth cameras
     unseen = float((cloud.points[:, :2].abs().amax(1) >= widest * cloud.points[:, 2]).double().mean())
     if unseen > 0.01:
@@ -203,7 +203,7 @@ def check_folder(path: Path) -> None:
 def holding(
     name: str, path: Path | None, hold: Callable[[Path], AbstractContextManager[None]] = hold_folder
 ) -> Iterator[None]:
-    """Lock the folder, or file, of an option against other runs within the context. None locks nothing."""
+    """Lock the folder or file of the option `name` against other runs within the context. None locks nothing."""
     with contextlib.ExitStack() as held:
         if path is not None:
             with naming(folder=name, path=name):
@@ -212,7 +212,7 @@ def holding(
 
 
 def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:
-    """Load the hand of --hand with --fingers; also return "auto" if its sets of fingers are to be compared."""
+    """Load the hand of --hand with --fingers; also return "auto" if all sets of fingers are to be tried."""
     with naming(hand="--hand", name="--hand", name_or_path="--hand", fingers="--fingers"):
         return (load_hand(hand), "auto") if fingers == "auto" else (load_hand(hand, fingers), None)
 

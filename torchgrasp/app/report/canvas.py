@@ -15,14 +15,14 @@ AXES = ("#d62728", "#2ca02c", "#1f4fd8")
 HAND, OBJECT, TABLE = "#a9b0ba", "#e9d7b3", "#eceae4"
 """Colours of the palm with parked fingers, of the object, and of the table."""
 OBJECTS = ("#e8743b", "#3f83d9", "#57a84f", "#b65fae", "#e0b92f", "#35aaa3", "#dd6b78", "#8474c9")
-"""Colours of the objects of a scene in the order of their labels, again from the first."""
+"""Colours of the objects of a scene in the order of their labels; after the last colour the first follows."""
 PAPER, INK, GRID, ALARM = "#fcfcfa", "#22262b", "#dcdad3", "#c2452d"
 """Colours of the background, of lines with text, of grid lines, and of the moment at which an object was lost."""
 SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a page of three columns
 
 
 class Triangles(NamedTuple):
-    """Corners of triangles with normals and colours in [0, 1]; unlit triangles keep their colours."""
+    """Triangles by their corners [m], with a normal and a colour in [0, 1] at each; unlit triangles get no shading."""
 
     corners: Float[np.ndarray, "t 3 3"]
     normals: Float[np.ndarray, "t 3 3"]
@@ -54,7 +54,7 @@ class Canvas:
         transparent: bool = False,
         lit: bool = True,
     ) -> None:
-        """Add a mesh with one colour, or a colour for each vertex; without `normals` large bends give sharp edges."""
+        """Add a mesh with one colour, or a colour for each vertex; without `normals`, strong bends look sharp."""
         corners = vertices[faces]
         bent = sharp_normals(vertices, faces) if normals is None else normals[faces]
         shade = np.broadcast_to(rgb(color), corners.shape) if isinstance(color, str) else color[faces]
@@ -122,7 +122,7 @@ class Canvas:
 def frame_camera(
     corners: Float[np.ndarray, "n 3"], direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE
 ) -> Camera:
-    """Return a camera that sees all `corners`; the fraction `drop` of the picture at the bottom stays empty."""
+    """Return a camera in `direction` that sees all `corners`; the lowest fraction `drop` of its picture stays empty."""
     angle = np.deg2rad(24.0)  # a long lens distorts little
     x, y, z = direction
     flat = float(np.hypot(x, y))
@@ -154,7 +154,7 @@ def sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Floa
 
 
 def concatenate(parts: list[Triangles]) -> Triangles:
-    """Return several sets of triangles, or none, as one set."""
+    """Join several sets of triangles, or none, to one set."""
     empty = np.zeros((0, 3, 3))
     none = Triangles(empty, empty, empty, np.zeros(0, dtype=bool))
     return Triangles(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
@@ -167,7 +167,7 @@ def render(
     size: tuple[int, int],
     background: tuple[float, float, float],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture of opaque triangles, with the nearest layer of half-transparent triangles over them."""
+    """Return the pixels of a picture of opaque triangles; over them lies the nearest layer of transparent triangles."""
     samples = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
     width, height = size[0] * samples, size[1] * samples
     image = np.tile(np.array(background, dtype=np.float32), (height * width, 1))
@@ -184,7 +184,7 @@ def render(
 def _cast(
     triangles: Triangles, camera: Camera, width: int, height: int
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
-    """Return the covered samples, with inverse distance and lit colour of the nearest triangle at each."""
+    """Return indices of the samples that triangles cover, with inverse distance and colour of the nearest one."""
     local = (triangles.corners - camera.position) @ camera.frame.T
     near = 1.0 / np.maximum(-local[..., 2], 1e-6)  # the scene is framed in front of the camera
     focal = height / 2 / np.tan(camera.angle / 2)
@@ -245,7 +245,7 @@ def rgb(color: str) -> tuple[float, float, float]:
 
 
 def map_colors(values: Float[np.ndarray, " n"], name: str) -> Float[np.ndarray, "n 3"]:
-    """Return the colours of values in [0, 1], by a matplotlib colour map."""
+    """Return the colours that the matplotlib colour map `name` gives to values in [0, 1]."""
     import matplotlib
 
     return matplotlib.colormaps[name](values)[:, :3]

@@ -17,7 +17,7 @@ SHARE_NAMES = {
     "top1": "best-ranked grasps that pass, of all views",
     "objects": "objects with a grasp that passes",
 }
-"""The shares of a summary in words."""
+"""Descriptions of the success rates of a summary."""
 
 
 @checked
@@ -46,7 +46,7 @@ def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], 
 
 
 def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> str:
-    """Return the HTML page of an evaluation."""
+    """Return the HTML page of an evaluation; `asked` are its settings by name."""
     summary = summarise(scores)
     groups = {"": summary} | {f"{group}: ": some for group, some in summary["by_group"].items()}
     most = max((n for reasons in summary["failures"].values() for n in reasons.values()), default=1)
@@ -83,7 +83,7 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
 
 
 def draw_bar(share: Share, width: int = 180) -> Any:
-    """Return a success rate as SVG: a mark on a bar, and its interval as a line; `width` in pixels."""
+    """Return an SVG of a success rate as a mark on a bar, with its interval as a line; `width` is in pixels."""
     from markupsafe import Markup
 
     value, low, high = (4 + (width - 8) * x for x in share[:3])

@@ -33,7 +33,7 @@ LETTERS = "abcdef"  # names of the moments in stills and plots
 
 
 def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction) -> bytes:
-    """Draw the film strip of a closing on the true object [m], which is in the frame of the grasp."""
+    """Return a PNG of the film strip of a closing; `mesh` is the true object [m] in the frame of the grasp."""
     from matplotlib.figure import Figure
 
     moments = moments_of(closure, _centre(mesh), hand.tips.names)
@@ -115,7 +115,7 @@ def _draw_stills(
 
 
 def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[Any]) -> None:
-    """Draw one plot from 0 to `top`; a title that ends with a colon means a legend."""
+    """Draw lines over time in one plot from 0 to `top`, with a legend if the title ends with a colon."""
     axis.set(xlim=(time[0], max(time[-1], time[0] + 0.1)), ylim=(0.0, top), facecolor=PAPER)
     axis.set_title(title, loc="left", color=INK, fontsize=13, pad=9)
     axis.grid(axis="y", color=GRID)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Sections = dict[str, list[tuple[str, bytes]]]
 
 GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
-"""Heads of `grasp_rows`; errors, angles and standard deviations are those of the worst finger."""
+"""Titles of the columns of a table of grasps; errors, angles and standard deviations are those of the worst finger."""
 
 
 @checked

@@ -110,7 +110,7 @@ def verdict(run: Run) -> str:
 
 
 def closing_sentence(run: Run) -> str:
-    """Return a sentence: whether the object was held, how far it rose, and how it moved in the hand."""
+    """Return a sentence that says whether the object was held, how far it rose, and how it moved in the hand."""
     upright = run.upright()
     closure, mesh = upright.closure, upright.mesh
     assert closure is not None and mesh is not None
@@ -139,7 +139,7 @@ def refusal(run: Run) -> str:
 
 
 def _too_low(run: Run) -> str:
-    """Return a remark if the object is lower than the hand's fingertips need; "" otherwise."""
+    """Return a remark if the object is too low for the hand's fingertips; "" otherwise."""
     spec = run.spec.for_fingertips(float(run.hand.tips.radius.max()))
     if spec.plane is None or not len(run.surface.vertices):
         return ""
@@ -148,24 +148,24 @@ def _too_low(run: Run) -> str:
 
 
 class Moment(NamedTuple):
-    """A key moment of a closing: its tick and its name."""
+    """A key moment of a closing: the index of its control tick, and its name."""
 
     tick: int
     name: str
 
     @property
     def color(self) -> str:
-        """The colour of its title and line in the film strip."""
+        """The colour of the moment's title and line in the film strip."""
         return ALARM if self.name == LOST else INK
 
 
 def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
-    """Return which fingertips touch the object at each tick."""
+    """Return a mask of the fingertips that touch the object at each control tick."""
     return closure.trace.normals.isfinite().all(-1)
 
 
 def first_touches(closure: ClosureResult) -> list[int]:
-    """Return the tick of each finger's first touch, in the order of `contact_order`."""
+    """Return the control tick at which each finger first touched the object, in the order of these touches."""
     touched = touching(closure)
     return [int(touched[:, finger].int().argmax()) for finger in closure.contact_order]
 
@@ -173,7 +173,7 @@ def first_touches(closure: ClosureResult) -> list[int]:
 def moved_in_hand(
     closure: ClosureResult, centre: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
-    """Return how far the object has moved [m] and turned [rad] in the hand since the pressing, at each tick."""
+    """Return for each tick how far the object has moved [m] and turned [rad] in the hand since the hand pressed."""
     hand_from_object = inverse(closure.hand_pose.double()) @ closure.object_pose.double()
     start = hand_from_object[tick_of(closure, 2)]
     centres = apply(hand_from_object, centre.double().expand(len(hand_from_object), 1, 3))[:, 0]
@@ -182,7 +182,7 @@ def moved_in_hand(
 
 
 def tick_of(closure: ClosureResult, phase: int) -> int:
-    """Return the tick at which a phase ended, or the last tick if the phase never ended."""
+    """Return the tick at which phase 0 (approach), 1 (closing) or 2 (pressing) ended; the last tick if it never did."""
     end = closure.phases[phase]
     return int((closure.time - end).abs().argmin()) if bool(end.isfinite()) else len(closure.time) - 1
 
@@ -209,7 +209,7 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
 
 
 def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> str:
-    """Return a sentence: when and in which phase the object was lost, and which finger failed first; "" if held."""
+    """Return a sentence on when and in which phase the object was lost, and which finger failed first; "" if held."""
     tick = find_loss(closure, centre)
     if tick is None:
         return ""
@@ -225,7 +225,7 @@ def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tu
 
 
 def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) -> str:
-    """Return a text that names the finger that slid or let go first, without firm contact until the tick."""
+    """Return a text that names the finger that first slid or let go for good before a tick; "" if none did."""
     touched, sliding = touching(closure)[: tick + 1], closure.trace.sliding[: tick + 1].nan_to_num(0.0)
     firm = touched & (sliding < 0.01)  # [m/s]: fingertips that stick creep more slowly
     # The first tick after which each finger was never firm again; the finger with the earliest gave way first.

@@ -83,7 +83,7 @@ def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "
 
 
 def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
-    """Return how much each pixel lies on the lines of a 10 cm grid in the table plane."""
+    """Return for each pixel, in [0, 1], how well it lies on the lines of a 10 cm grid in the table plane."""
     flat = DepthImage(torch.ones_like(image.depth), image.intrinsics, image.obj_from_camera).points()
     camera, normal = image.obj_from_camera[:3, 3].double(), table.normal.double()
     rays = flat - camera
@@ -120,7 +120,7 @@ def _light(scene: Scene) -> Float[np.ndarray, "h w"]:
 
 
 def _rim(labels: np.ndarray, width: int) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels next to a pixel with another label."""
+    """Return a mask of the pixels with another label in the square of `width` pixels around them."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     whole = labels.astype(int)

@@ -45,7 +45,7 @@ def solids_of_links(hand: Hand) -> list[Solid]:
 def link_poses(
     hand: Hand, joints: Float[Tensor, "n j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "n 4 4"]
 ) -> Float[Tensor, "n l 4 4"]:
-    """Return the poses of all links in the object's frame; `names` gives the order of the joints [rad]."""
+    """Return the poses of all links in the object's frame; `names` are those of the `joints` [rad]."""
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()
     return obj_from_hand.double()[:, None] @ hand.tree.poses(values)
 
@@ -53,7 +53,7 @@ def link_poses(
 def solids_from_hand(
     hand: Hand, joints: Float[Tensor, " j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "4 4"]
 ) -> list[Solid]:
-    """Return the collision shapes of a hand as meshes in the object's frame; arguments as in `link_poses`."""
+    """Return the collision shapes of a hand as meshes in the object's frame; `names` are those of `joints` [rad]."""
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
     return [
         solid._replace(
@@ -76,7 +76,7 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
 
 @functools.lru_cache(maxsize=512)  # a hand is drawn many times
 def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and normals of a shape with rounded edges, the hull of balls, in its link's frame."""
+    """Return vertices, faces and vertex normals of a collision shape with rounded edges, in its link's frame."""
     from scipy.spatial import ConvexHull
     from trimesh import creation
     from trimesh.transformations import euler_matrix

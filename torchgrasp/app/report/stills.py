@@ -32,7 +32,7 @@ from torchgrasp.values import Contacts, Grasps, PointCloud
 
 
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
-    """Draw a cloud from its camera, coloured by height."""
+    """Return a PNG of a cloud from its camera, coloured by height; `table` is the height [m] of the table."""
     points = _thinned(to_array(cloud.points), 3000)
     height = points[:, 2] - points[:, 2].min()
     canvas = Canvas()
@@ -42,7 +42,7 @@ def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
 
 
 def draw_surface(surface: Surface, direction: Direction, table: float | None = None) -> bytes:
-    """Draw the estimated surface, coloured by its standard deviation [mm]."""
+    """Return a PNG of the estimated surface seen from `direction`, coloured by its standard deviation [mm]."""
     vertices, std_mm = to_array(surface.vertices), 1e3 * to_array(surface.std_m)
     most = max(float(np.quantile(std_mm, 0.99)), 1e-3)
     canvas = Canvas()
@@ -53,7 +53,7 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
 
 
 def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:
-    """Draw the contacts of the first grasp, with normals, on the estimated surface."""
+    """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface."""
     vertices = to_array(surface.vertices)
     canvas = Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals), transparent=True)
@@ -63,14 +63,14 @@ def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, ta
 
 
 def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None) -> bytes:
-    """Draw the hand of the first grasp on the estimated surface."""
+    """Return a PNG of the hand of the first grasp on the estimated surface, seen from `direction`."""
     canvas, corners = _grasp(surface, hand, grasp)
     canvas.add_table(corners, table)
     return canvas.render_png(corners, direction)
 
 
 def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direction: Direction) -> bytes:
-    """Draw the hand of the first grasp on the target, among the measured points of its neighbours."""
+    """Return a PNG of the hand of the first grasp on the target, among the measured points of other objects."""
     canvas, corners = _grasp(surface, hand, grasp)
     others = (scene.labels > 0) & ~scene.rows_of()
     points, labels = to_array(scene.points[others]), scene.labels[others].cpu().numpy()
@@ -82,7 +82,7 @@ def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direct
 
 
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
-    """Draw a hand, its pads' normals and its palm's axes at a posture and at both limits, and the joints' ranges."""
+    """Return a PNG of a hand with pad normals and palm axes at a posture and both limits, and of the joint ranges."""
     from matplotlib.figure import Figure
     from PIL import Image
 
@@ -113,7 +113,7 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
-    """Draw a hand at a posture, with its fingertip normals and the axes of its palm."""
+    """Return a PNG of a hand at a posture [rad], with its fingertip normals and the axes of its palm."""
     solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints))
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     arrow, axis = 0.03, 0.6 * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
@@ -126,7 +126,7 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
 
 
 def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
-    """Return the posture in which the fingertip pads face each other best, without self-collision if possible."""
+    """Return the one of n postures in which the fingertip pads face each other best, if possible without collision."""
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
     facing = (normals * unit(inward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(inward, dim=-1).amax(1)
@@ -134,7 +134,7 @@ def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "
 
 
 def view_of(cloud: PointCloud) -> Direction:
-    """Return the direction from a cloud to its camera; a fixed direction if the camera is unknown."""
+    """Return the direction from a cloud to its camera, or a fixed direction if the camera is unknown."""
     first = cloud.split_views()[0].viewpoint
     if first is None:
         return (1.0, -0.8, 0.6)
@@ -143,7 +143,7 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return a direction from which all fingers of the first grasp are visible, perpendicular to the normals."""
+    """Return a viewing direction across the contact normals, from which all fingers of the first grasp are visible."""
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
     across = torch.stack([-press[1], press[0]])
@@ -165,7 +165,7 @@ def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
 
 
 def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[Canvas, Float[np.ndarray, "n 3"]]:
-    """Return a canvas with the surface and the first grasp's hand and contacts, and all points to frame."""
+    """Return a canvas with the surface and the first grasp's hand and contacts, and the points that must be in view."""
     joints, vertices = hand.expand_joints(grasp.joints[0].double()), to_array(surface.vertices)
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     canvas = Canvas()
@@ -188,7 +188,7 @@ def add_solids(canvas: Canvas, solids: list[Solid]) -> None:
 
 
 def _joint_colors(hand: Hand) -> list[str]:
-    """Return the colour for each actuated joint: that of its finger, or of the palm if it moves several fingers."""
+    """Return the colour of each actuated joint: the colour of its finger, or the palm if it moves several fingers."""
     finger_of_link = finger_of_links(hand)
     finger_of_joint = [finger_of_link[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
     moved = [{finger_of_joint[j] for j in torch.nonzero(row)[:, 0].tolist()} for row in hand.actuated.coupling.T]
@@ -196,7 +196,7 @@ def _joint_colors(hand: Hand) -> list[str]:
 
 
 def _label_colors(labels: np.ndarray) -> Float[np.ndarray, "*b 3"]:
-    """Return the colour for each label; 0 is the table."""
+    """Return the colour of the object with each label; label 0 gives the table's colour."""
     palette = np.stack([rgb(name) for name in (TABLE, *OBJECTS)])
     return palette[np.where(labels > 0, 1 + (labels - 1) % len(OBJECTS), 0)]
 

@@ -30,7 +30,7 @@ from torchgrasp.values import Grasps
 
 VIEW = "view.html"  # name of the page beside the report
 MOST_GRASPS, MOST_FACES, MOST_TICKS = 20, 40_000, 120
-"""Most grasps, faces of a mesh and ticks of a replay, so that a page has a few megabytes."""
+"""Largest numbers of grasps, faces of a mesh and ticks of a replay, so that a page has a few megabytes."""
 POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
 """Postures of the hand in the order of its motion; the last is the target of its drives."""
 
@@ -39,7 +39,7 @@ POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
 def write_viewer(path: Path | str, run: Run) -> Path:
     """Write a run as a 3D page in one HTML file, atomically. The page needs WebGL, but no network.
 
-    The page shows the cloud, the surface by its standard deviation with a shell at k deviations, contacts, four
+    The page shows the cloud, the surface by its standard deviation, a shell at k standard deviations, contacts, four
     postures of the hand for each of the best 20 grasps, and the closing with its forces. The address may name a
     state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`.
 
@@ -128,12 +128,12 @@ def _eye(direction: Direction) -> list[float]:
 
 
 def _points(points: Float[Tensor, "n 3"]) -> dict[str, object]:
-    """Return at most 10,000 points of a cloud, as a packed buffer."""
+    """Return at most 10,000 points of a cloud, encoded by `pack`."""
     return pack(to_array(points)[thin_rows(len(points), 10_000)])
 
 
 def _surface(run: Run) -> dict[str, object]:
-    """Return the estimated surface with standard deviations and colours, as packed buffers."""
+    """Return the estimated surface with standard deviations and colours, encoded by `pack`."""
     surface, std_m = run.surface, to_array(run.surface.std_m)
     kept, faces = thin_mesh(to_array(surface.vertices), surface.faces.cpu().numpy(), MOST_FACES)
     most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6
@@ -167,7 +167,7 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
 
 
 def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
-    """Return the data of the replayed closing: object mesh, poses of object and links at some ticks, forces at all."""
+    """Return the data of the replayed closing: mesh, poses of object and links at some ticks, forces at all ticks."""
     assert run.mesh is not None
     ticks = thin_rows(len(closure.time), MOST_TICKS)
     kept, faces = thin_mesh(np.asarray(run.mesh.vertices), np.asarray(run.mesh.faces), MOST_FACES)
@@ -192,7 +192,7 @@ def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
 def thin_mesh(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], most: int
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "g 3"]]:
-    """Return which vertices to keep, one in each cell of a grid so coarse that `most` faces remain, and the faces."""
+    """Return the indices of the vertices to keep, one in each cell of a grid, and at most `most` faces between them."""
     kept, thinned = np.arange(len(vertices)), faces
     cell = float(np.linalg.norm(np.ptp(vertices, axis=0))) / 256 if len(vertices) else 0.0
     while len(thinned) > most:
