@@ -91,7 +91,7 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return the joint targets with which joint drives of a `stiffness` [N m/rad] exert given fingertip forces [N]."""
+    """Return joint targets [rad] and torques [N m] with which drives of a `stiffness` [N m/rad] exert given forces."""
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
 
@@ -103,7 +103,7 @@ def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint with its coupled joints; `kp` replaces the hand's own."""
+    """Return the stiffness [N m/rad] of each actuated joint, coupled joints included; `kp` replaces the hand's own."""
     coupling = hand.actuated.coupling
     return (coupling**2 * drive_stiffness(hand, kp).to(coupling)[:, None]).sum(0)
 

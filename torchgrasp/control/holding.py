@@ -177,7 +177,7 @@ class GripHold:
         return contacts
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
-        """Return the part of a load wrench that weight can cause: a force normal to the table, a limited torque."""
+        """Return the part of a load wrench that weight can cause: an upward force and a limited torque."""
         if self.up is None:
             return load
         lifted = max(float(load[:3] @ self.up), 0.0)
@@ -238,7 +238,7 @@ class GripHold:
             self.status = Status.TOO_HEAVY
 
     def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
-        """Return the forces [N] for the drives to exert: `wanted` with feedback, and with a load that grows slowly."""
+        """Return the fingertip forces [N] to command: `wanted`, corrected by feedback; new load is taken up slowly."""
         if self.time > RAMP:
             lacking = ((self.felt - wanted) * self.normals).sum(-1)
             self.trim = self.trim - period * 4.0 * lacking[:, None] * self.normals

@@ -59,7 +59,7 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
 
 
 def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the position gain [1/s] on each axis (K_P, Eq. 27 of the paper): a constant over the axis's variance."""
+    """Return the position gain [1/s] on each axis (Eq. 27 of the paper): a constant divided by the axis's variance."""
     return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
 

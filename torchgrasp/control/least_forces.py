@@ -24,7 +24,7 @@ PENALTY, KNEE = 500.0, 0.9
 
 
 class Balance(NamedTuple):
-    """The grasp map of contacts, which gives the wrench of the n force components; its pseudo-inverse; its null space.
+    """The grasp map of contacts (matrix from n force components to the wrench), its pseudo-inverse and its null space.
 
     The columns of `free` are a basis of the null space: k internal forces, which exert no wrench.
     """
@@ -125,6 +125,7 @@ class _Barrier:
         return self.basis.T @ (forces.ravel() - share * self.carried)
 
     def forces(self, z: Float[Array, "*g k"]) -> Float[Array, "*g f 3"]:
+        """Return the fingertip forces [N] at coordinates z; they carry the load."""
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:

@@ -77,7 +77,7 @@ def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
 
 
 class Touches:
-    """Time averages of the contact points and normals that a resting hand senses, in the frame of its planned pose.
+    """Time averages of the contact points and normals that a resting hand senses, in the frame of the planned hand.
 
     `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have reported where.
     """

@@ -30,7 +30,7 @@ OPENING_TIME = 0.5  # time [s] in which the fingers open
 
 
 def can_guard(reference: ClosingReference) -> bool:
-    """Return whether the hand can stop at a touch: it needs an approach, a table, a surface and tactile fingertips."""
+    """Return whether the hand can stop at a touch: the plan has approach, table and surface, the tips are tactile."""
     known = reference.approach is not None and reference.table is not None and reference.surface is not None
     return known and reference.sensor.kind == "tactile"
 

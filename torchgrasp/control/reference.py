@@ -144,7 +144,7 @@ class ClosingReference(Value):
 
     @property
     def alive(self) -> Bool[Tensor, "f"]:
-        """Whether the sensor of each fingertip works; raises `BadArgument` if a dead finger is not of the hand."""
+        """Whether the sensor of each fingertip works; raises `BadArgument` if the plan names an unknown finger."""
         names, dead = self.hand.finger_names, self.sensor.dead
         if not set(dead) <= set(names):
             raise BadArgument("sensor", f"dead fingers {dead}", f"dead fingers among {names}")

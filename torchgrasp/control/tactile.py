@@ -68,7 +68,7 @@ class TactileState(Value):
 
 @checked
 def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
-    """Return the tactile state of fingertips that touch nothing, with leading axes `batch`; the next tick samples them.
+    """Return the tactile state, with leading axes `batch`, of tips that touch nothing and are sampled at the next tick.
 
     >>> no_contact().contact
     tensor([False, False, False])

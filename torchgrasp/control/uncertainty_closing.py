@@ -61,7 +61,7 @@ class UncertaintyClosing:
         return self
 
     def press(self) -> "UncertaintyClosing":
-        """Let the fingers, which may be waiting, press with the desired forces, and keep the palm; return `self`."""
+        """Let all fingers, even waiting ones, press with their desired forces; keep the palm at rest; return `self`."""
         self.waits, self.reach = False, 0.0
         return self
 

@@ -37,7 +37,7 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     folder cannot be written, a warning is logged.
 
     Raises:
-        MeshError, SuspiciousScale: as `read_mesh`, or a mesh whose decomposition takes too much time or memory.
+        MeshError, SuspiciousScale: as raised by `read_mesh`; also a mesh that takes too much time or memory to cut.
         MissingExtra: the mesh is not convex and CoACD is not installed.
 
     >>> import trimesh

@@ -114,7 +114,7 @@ def _hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
 
 
 def import_sapien() -> tuple[Any, Any]:
-    """Import SAPIEN and its physics module; no warning tells that Vulkan is missing, because physics works without."""
+    """Import and return SAPIEN and its physics; its warning about missing Vulkan, which physics can lack, is hidden."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -82,8 +82,7 @@ class Scene(abc.ABC):
     def _map_contacts(self, tables: Iterable[Any], carriers: Iterable[Any]) -> None:
         """Store which index into `StepContacts.stray` belongs to each body, and which finger to each link.
 
-        `tables` are the bodies of the table. `carriers` holds for each fingertip the link that carries it rigidly, or
-        None.
+        `tables` are the table's bodies. `carriers` holds for each fingertip the link that carries it rigidly, or None.
         """
         self._place_of = {self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
         self._place_of |= dict.fromkeys(tables, TABLETOP)
@@ -93,7 +92,7 @@ class Scene(abc.ABC):
                 self._finger_of.setdefault(carrier, i)
 
     def step(self) -> StepContacts:
-        """Advance by one timestep and return the sums of the contacts between fingertips and object."""
+        """Advance by one timestep and return the hand's contacts during it, summed per finger."""
         contacts = StepContacts.none(len(self.tips))
         for first, second, read in self._advance():
             if (first in self._place_of) == (second in self._place_of):
@@ -152,7 +151,7 @@ class Scene(abc.ABC):
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set the target of the approach, as the length `left` [m] that then remains, and the speed [m/s]."""
+        """Set how far [m] before the end of its approach the hand shall be (`left`), and its target speed [m/s]."""
         self._move_mount(APPROACH_JOINT, -left, speed)
 
     @checked

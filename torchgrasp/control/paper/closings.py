@@ -77,7 +77,7 @@ class Settled:
         period: float,
         pressing: bool = True,
     ) -> None:
-        """Update `time` [s] by one tick: all fingers must touch and, with `pressing`, press steadily, else it is 0."""
+        """Add a tick to `time` if all fingers touch and, with `pressing`, press steadily; otherwise set `time` to 0."""
         average = observation.tactile.average
         settled = bool(touching.all())
         if pressing:

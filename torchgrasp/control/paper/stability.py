@@ -39,7 +39,7 @@ PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return a grasp's state: logarithms of spring stiffness [N/m], `lengths_of` the tips [m] and normal forces [N]."""
+    """Return a grasp's state: logarithms of spring stiffness [N/m], distances [m] of tips to centroid, forces [N]."""
     return torch.cat([springs, lengths, forces.clamp_min(LEAST_FORCE)], -1).log()
 
 
