@@ -1,8 +1,8 @@
 """Collision shapes of a hand's links: covering spheres, exact boxes, and the pairs of links that can collide.
 
 Spheres give the clearance from object and table: each collision shape is cut into cells, with one sphere for each cell.
-No surface with a radius of curvature above 25 mm reaches a face between the spheres. Exact boxes and spheres give
-self-collision; there a cylinder becomes a prism of twelve sides.
+No surface with a radius of curvature above 25 mm reaches a face between the spheres. Exact boxes and spheres are tested
+for self-collision; in this test a cylinder becomes a prism of twelve sides.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ ALWAYS = 0.98  # links that overlap in a larger share of the postures overlap by
 
 @dataclasses.dataclass(frozen=True)
 class CollisionSpheres(Value):
-    """Spheres [m] that cover a hand's links, each fixed to one link.
+    """Spheres [m] that cover a hand's links, each with its centre in the frame of one link.
 
     `finger` is the finger's index in grasp order, -1 for the palm, -2 for a finger that does not grasp. `touching`
     marks the spheres of fingertips.
@@ -69,7 +69,7 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
 
 
 def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
-    """Return the centres and the radius of spheres that cover a shape, on cells of about the size `cell` [m]."""
+    """Return the centres and the radius [m] of spheres that cover a shape, one for each cell of about size `cell`."""
     single_layer = 0.025  # a shape thinner than this [m] has one layer of cells across
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
@@ -125,7 +125,7 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
 
 
 def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
-    """Return rotation, centre, half sizes and radius of a shape's boxes or sphere; a cylinder becomes six boxes."""
+    """Return rotation, centre, half sizes and radius [m] of each box or sphere of a shape; a cylinder is six boxes."""
     rotation = rotation_from_rpy(shape.rpy)
     if shape.kind == "sphere":
         return [(rotation, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]
@@ -139,7 +139,7 @@ def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, flo
 
 
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
-    """Return the pairs of links, not neighbours, that collide in some of n random postures but not in nearly all.
+    """Return the pairs of links that collide in some of n random postures but not in nearly all, without neighbours.
 
     Raises:
         BadArgument: n outside [1, 10^7]; a coupling with joints that the URDF lacks.
@@ -175,7 +175,7 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
 
 
 def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int) -> None:
-    """Raise `HandFileError` if too many separations must be measured; `ahead` postures are like those of `frames`."""
+    """Raise `HandFileError` if `ahead` more postures, like those of `frames`, need over `most` exact separations."""
     left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
     if left > most:
         found = f"{len(shapes.pairs)} pairs of shapes so near each other that {left} separations must be measured"
@@ -183,7 +183,7 @@ def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l 
 
 
 def draw_postures(urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int) -> Float[Tensor, "j n"]:
-    """Draw random positions of all movable joints (j, n), uniform within the limits; coupled joints follow."""
+    """Return random positions of all movable joints (j, n), uniform within the limits; coupled joints follow."""
     movable = {j.name: j for j in urdf.movable}
     unknown = sorted(({*coupling} | {mimic.source for mimic in coupling.values()}) - set(movable))
     if unknown:

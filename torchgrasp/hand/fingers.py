@@ -24,7 +24,7 @@ ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
 class ActuatedJoints(Value):
     """The joints [rad or m] that move the grasping fingers, and the coupling of all joints to them.
 
-    All movable joints of the URDF are at `coupling @ joints + offset`.
+    The positions of all movable joints of the URDF are `coupling @ joints + offset`.
 
     >>> from torchgrasp import load_hand
     >>> actuated = load_hand("barrett").actuated
@@ -67,7 +67,7 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` as `check`, and for joints beyond their limits by more than float32 rounding."""
+        """Raise `BadArgument` if `check` does, or if a joint is beyond its limits by more than float32 rounding."""
         self.check(joints, name)
         low, high = self.lower.to(joints) - 1e-6, self.upper.to(joints) + 1e-6
         self._refuse(name, joints, (joints < low) | (joints > high), None)
@@ -81,7 +81,7 @@ class ActuatedJoints(Value):
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the actuated joints and leaders of coupled ones; raise `HandFileError` for joints without a range."""
+    """Return the actuated joints, with those that coupled joints follow; raise `HandFileError` for an empty range."""
     movable = {j.name: j for j in urdf.movable}
     own = [j for f in spec.fingers for j in f.joints]
     leaders = [spec.coupling[j].source for j in own if j in spec.coupling]
@@ -111,8 +111,8 @@ class Fingertips(Value):
     """The fingertips in grasp order: names, links, and the contact pad of each in its link's frame.
 
     `index` is the index of each tip's link in the whole kinematic tree. Each tip is rigidly attached to a carrier, the
-    last link that a joint moves. `chains` is the part of the tree that leads to the carriers, and `carrier` their index
-    in it.
+    last link that a joint moves. `chains` is the part of the tree that leads to the carriers, and `carrier` is the
+    index of each carrier in this part.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")
@@ -142,14 +142,14 @@ class Fingertips(Value):
 
     @functools.cached_property
     def in_carriers(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """`contact`, `normal` and `center` of the pads in the frames of the carriers."""
+        """Contact points, normals and centres of the pads, in the frames of the carriers (see `Fingertips`)."""
         pose = self.carrier_from_tip
         contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
         return contact, map_directions(pose, self.normal)[..., 0].T, center
 
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
-        """Return the frames of all links of `chains`, and of the carriers, given all joints (j, n)."""
+        """Return the poses (3 x 4) of all links of `chains` and of the carriers, given all joint positions (j, n)."""
         if len(values) != (every := len(self.chains.joint_names)):
             raise BadArgument("values", f"{len(values)} joints", f"all {every} joints of the URDF")
         frames = self.chains.frames(values)
@@ -157,7 +157,7 @@ class Fingertips(Value):
 
 
 def tips_from_files(spec: HandSpec, urdf: Urdf) -> Fingertips:
-    """Return the fingertips of the grasping fingers."""
+    """Return the fingertips of the grasping fingers, as hand.toml and URDF describe them."""
     links, tips = [x.name for x in urdf.links], tuple(f.tip_link for f in spec.fingers)
     pads = zip(*(f.pad for f in spec.fingers), strict=True)
     contact, normal, center, radius = (torch.tensor(x, dtype=torch.float64) for x in pads)

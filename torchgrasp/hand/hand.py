@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Actuator(NamedTuple):
-    """Drive of one joint: effort [N m], velocity [rad/s], stiffness [N m/rad], damping [N m s/rad].
+    """Drive of one joint: greatest effort [N m] and velocity [rad/s], stiffness [N m/rad], damping [N m s/rad].
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").actuators["f1_flex"].effort
@@ -55,7 +55,7 @@ class HandSource(NamedTuple):
 class Hand(Value):
     """A robot hand with three to five grasping fingers, in grasp order.
 
-    Positions [m] are in the palm's frame, the root link of the URDF. `approach` is the direction out of the palm.
+    Positions [m] are in the frame of the palm, the URDF's root link. `approach` is the direction out of the palm.
 
     `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
     `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
@@ -101,7 +101,7 @@ class Hand(Value):
 
     @functools.cached_property
     def motion(self) -> FreeMotion:
-        """How links, collision spheres, tip centres and pads move with the pose and the actuated joints."""
+        """Tables of how links, collision spheres, tip centres and pads move with the hand's pose and its joints."""
         spheres, tips = self.collision_spheres, self.tips
         points = (spheres.link_index, spheres.center, 1.0), (tips.index, tips.center, 1.0)
         return FreeMotion.of(self.tree, self.actuated.coupling, [*points, (tips.index, tips.normal, 0.0)])
@@ -173,14 +173,14 @@ class Hand(Value):
 
     @checked(gradients=True)
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
-        """Return the pose `hand_from_link` of every link, in the order of `tree.link_names`."""
+        """Return the pose `hand_from_link` (4 x 4) of every link, in the order of `tree.link_names`."""
         values = self.expand_joints(joints)
         poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
 
     @checked(gradients=True)
     def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return the contact points [m] and outward unit normals of the fingertip pads."""
+        """Return the contact points [m] and outward unit normals of the fingertip pads, in the palm's frame."""
         _, carriers = self.tips.frames(self._columns(joints))
         contact, normal, _ = self.tips.in_carriers
         return _rows(map_points(carriers, contact), joints), _rows(map_directions(carriers, normal), joints)
@@ -195,7 +195,7 @@ class Hand(Value):
     def jacobian(
         self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
-        """Return the Jacobian [m/rad] of the fingertips' contact points by the actuated joints.
+        """Return the Jacobian [m/rad] of the fingertips' contact points with respect to the actuated joints.
 
         `at` are points [m] fixed to the fingertips, such as where round tips touch; by default the contact points.
         """
@@ -221,7 +221,7 @@ class Hand(Value):
 
     @checked(gradients=True)
     def sphere_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
-        """Return the centres [m] of the `collision_spheres`."""
+        """Return the centres [m] of the `collision_spheres` in the palm's frame."""
         spheres, frames = self.collision_spheres, self.tree.frames(self._columns(joints))
         return _rows(map_points(frames.index_select(2, spheres.link_index), spheres.center), joints)
 
@@ -249,7 +249,7 @@ class Hand(Value):
 
     @property
     def self_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of the pairs of links that can meet, as `self_clearance` tests them."""
+        """The names of each pair of links that `self_clearance` tests for collision."""
         names = self.tree.link_names
         return tuple((names[one], names[two]) for one, two in self.self_collision.link_pairs())
 
@@ -260,5 +260,5 @@ class Hand(Value):
 
 
 def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
-    """Return a tensor with postures in the last axis with its axes reversed, and with the batch shape of `joints`."""
+    """Return a tensor, whose last axis counts postures, with reversed axes and the batch shape of `joints` first."""
     return columns.permute(*range(columns.ndim - 1, -1, -1)).reshape(*joints.shape[:-1], *columns.shape[-2::-1])

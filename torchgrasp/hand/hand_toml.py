@@ -1,4 +1,4 @@
-"""Reader of hand.toml: fingers, pads, coupled and parked joints, pairs of links that can collide."""
+"""Reader of hand.toml, which tells a hand's fingers, pads, coupled and fixed joints, and links that can collide."""
 
 import dataclasses
 import functools
@@ -38,7 +38,7 @@ class Pad(NamedTuple):
 
 
 class Finger(NamedTuple):
-    """A finger with its joints from the palm outward."""
+    """A finger: its joints from the palm outward, the link of its tip, and the pad that touches objects."""
 
     name: str
     joints: tuple[str, ...]
@@ -53,7 +53,7 @@ Fingers = str | int | tuple[str, ...]
 
 
 class Option(NamedTuple):
-    """An option of hand.toml: the grasping fingers, and the positions [rad] of parked joints."""
+    """An option of hand.toml: the grasping fingers, and the positions [rad] of parked joints, which stay fixed."""
 
     fingers: Grasping
     parked: dict[str, float]
@@ -81,12 +81,12 @@ class HandSpec:
     data: bytes
 
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Return the error for a broken rule of hand.toml."""
+        """Return the error to raise if hand.toml has `found` in place of `allowed`."""
         return HandFileError("hand.toml", f"{self.path}: {found}", allowed)
 
 
 def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
-    """Read and check a hand.toml; raise `HandFileError`, or `BadArgument` for fingers that it does not have."""
+    """Read and check a hand.toml; raise `HandFileError`, or `BadArgument` for fingers that the hand lacks."""
     path, refuse = Path(path), functools.partial(HandFileError, "hand.toml")
     data = read_bounded(path, TOML_BYTES, "a hand.toml", refuse)
     try:
@@ -118,7 +118,7 @@ def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
 
 
 def _entries(table: Field, required: Sequence[str], optional: Mapping[str, Any]) -> dict[str, Field]:
-    """Return the fields of a table, with defaults for the optional; refuse unknown keys, which are often misspelt."""
+    """Return the fields of a table, with defaults for optional keys; refuse unknown keys, as misspelt ones."""
     fields = table.entries()
     for key in sorted(fields.keys() - {*required, *optional}):
         raise fields[key].wrong(f"one of {sorted([*required, *optional])}")
@@ -128,7 +128,7 @@ def _entries(table: Field, required: Sequence[str], optional: Mapping[str, Any])
 
 
 def _word(field: Field) -> str:
-    """Return a name, which is not empty and can be printed."""
+    """Return the text of a field; refuse a text that is empty, too long or not printable."""
     if not (text := field.text(XML_LETTERS)) or not text.isprintable():
         raise field.wrong(f"a text of 1 to {XML_LETTERS} characters")
     return text

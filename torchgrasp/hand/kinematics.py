@@ -1,7 +1,7 @@
 """Forward kinematics of a URDF's tree, level by level, for all postures at once.
 
-The frame of a child link in its parent is `constant + sine sin q + cosine cos q + slide q`, with four tables that are
-computed once.
+The pose of a child link in its parent is `constant + sine sin q + cosine cos q + slide q`, where q is the position of
+the joint between them. The four tables are computed once.
 """
 
 import dataclasses
@@ -28,9 +28,10 @@ class KinematicTree(Value):
     `child[j]` is the link that joint j moves, or 0 if it is outside this part; `axis` is in that link's frame.
     `prismatic` is 1 for a sliding joint, and `moves[l, j]` is 1 if joint j moves link l.
 
-    In `tables` the links are sorted by level; `level_sizes` counts them. `joint` is the index of the joint that moves a
-    link, 0 for a fixed link. `parent` is the index of a link's parent in the level above. `places` are the indices of
-    `link_names` among the sorted links.
+    `tables` hold each link's pose in its parent: its constant part, and factors of sin q, cos q and q. In them, links
+    are sorted by level, the number of joints from the root; `level_sizes` counts the links of each level. `joint` is
+    the index of the joint that moves a link, 0 for a fixed link. `parent` is the index of a link's parent in the level
+    above. `places` are the indices of `link_names` among the sorted links.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -60,9 +61,9 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Float[Tensor, "3 4 l n"]:
-        """Return the upper three rows of `root_from_link` of every link; the last axis counts the postures.
+        """Return the upper three rows of every link's pose in the root's frame; the last axis counts the postures.
 
-        With `root`, the root's poses in another frame, the link poses are in that frame too.
+        If `root` gives the poses of the root in another frame, the link poses are in that frame.
         """
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))
@@ -93,7 +94,7 @@ class KinematicTree(Value):
 
     @checked(gradients=True)
     def joint_axes(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return the axis and a point of every joint in the root's frame, given the link poses."""
+        """Return the unit axis and a point [m] of every joint in the root's frame, given the link poses."""
         child = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0).index_select(2, self.child)
         axes, origins = (x.permute(2, 1, 0) for x in (map_directions(child, self.axis), child[:, 3]))
         size = (*poses.shape[:-3], len(self.child), 3)
@@ -108,8 +109,8 @@ class FreeMotion(Value):
     actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling` maps a step of pose (six numbers) and
     actuated joints to the motions; None means the identity.
 
-    `product` maps all link frames to all markers in one matrix product, in groups of `sizes`. The markers are the given
-    ones, then each motion's origin, rotation axis and translation axis; one of the two axes is zero.
+    `product` maps all link frames to all markers in one matrix product, in groups of `sizes`. First come the given
+    markers, then each motion's origin, rotation axis and translation axis; one of the two axes is zero.
     """
 
     product: Float[Tensor, "m k"]
@@ -124,7 +125,7 @@ class FreeMotion(Value):
         coupling: Float[Tensor, "j h"],
         markers: Sequence[tuple[Int[Tensor, "_"], Float[Tensor, "_ 3"], float]],
     ) -> "FreeMotion":
-        """Return the tables of motions and marker groups: links, coordinates, and 1 for points or 0 for directions."""
+        """Return the tables for groups of markers: link indices, coordinates, and 1 for points or 0 for directions."""
         own = torch.nonzero((coupling != 0).any(1))[:, 0]
         axes, slides = torch.eye(3).to(tree.axis), tree.prismatic[own]
         root = torch.nonzero(tree.places == 0)[:, 0].expand(6)
@@ -142,18 +143,18 @@ class FreeMotion(Value):
         return cls(product.flatten(1), tuple(len(x) for x in local), moves, None if same else whole)
 
     def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
-        """Return the coordinates of each group of markers, given all link frames."""
+        """Return the coordinates of each group of markers in the root's frame, given all link frames."""
         product = self.product.to(frames).expand(3, -1, -1)
         return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
 
 
 def map_points(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
-    """Map one point of each link frame into the root's frame."""
+    """Return points in the root's frame, given the link frames (3 x 4) and one point in each of them."""
     return map_directions(frames, local) + frames[:, 3]
 
 
 def map_directions(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
-    """Map one direction of each link frame into the root's frame."""
+    """Return directions in the root's frame, given the link frames (3 x 4) and one direction in each of them."""
     x, y, z = local.to(frames)[:, :, None].unbind(1)
     return torch.addcmul(torch.addcmul(frames[:, 0] * x, frames[:, 1], y), frames[:, 2], z)
 
@@ -188,7 +189,7 @@ def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> Kinematic
 
 
 def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
-    """Return a URDF as a chain of pytorch-kinematics, whose reader rounds angles; coupled joints are independent."""
+    """Return a URDF as a pytorch-kinematics chain with unrounded angles; coupled joints become independent."""
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Link
     from pytorch_kinematics.frame import Joint as Mover
@@ -208,7 +209,7 @@ def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
 
 
 def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
-    """Return the last link that a joint moves above a given link (its carrier), and the given link's pose in it."""
+    """Return a link's carrier, the last link up to it that a joint moves, and the link's pose in the carrier."""
     above = {j.child: j for j in urdf.joints}
     pose = _tables(None)[0]
     while link in above and above[link].kind == "fixed":
@@ -219,7 +220,7 @@ def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
 
 
 def _tables(joint: Joint | None) -> Float[Tensor, "4 3 4"]:
-    """Return the four tables of a joint's pose in its parent; None gives those of the root."""
+    """Return the tables constant, sine, cosine and slide of a joint's pose in its parent; None stands for the root."""
     tables = torch.zeros(4, 3, 4, dtype=torch.float64)
     constant, sine, cosine, slide = tables
     if joint is None:

@@ -145,7 +145,7 @@ def _check_names(spec: HandSpec, urdf: Urdf) -> None:
 
 
 def _check_mimics_and_shapes(spec: HandSpec, urdf: Urdf) -> None:
-    """Raise `HandFileError` for contradicted mimic joints, tips without shapes, and hands of only fingertips."""
+    """Raise `HandFileError` if couplings contradict the URDF, or if a tip or all other links lack collision shapes."""
     for joint in urdf.joints:
         if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:
             found = f"joint {joint.name} follows {spec.coupling.get(joint.name, 'nothing')}"

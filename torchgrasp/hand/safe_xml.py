@@ -69,7 +69,7 @@ class _BoundedBuilder(ET.TreeBuilder):
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Parse the bytes of a URDF; return only its links and joints, with checked numbers. Raises `HandFileError`."""
+    """Return the XML tree of a URDF with only links and joints, and with checked numbers, or raise `HandFileError`."""
     # also within comments: a declaration may be hidden by a processing instruction that looks like a comment
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "a URDF without declarations")

@@ -18,7 +18,7 @@ from torchgrasp.hand.kinematics import map_points
 Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]  # largest separation [m] that is needed exactly
 Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]  # axes and centres of shapes in the palm's frame
 Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]]
-"""Function of pairs: the directions in which second shapes leave the first, and points on which the pushes act."""
+"""Function of pair indices; it returns the directions in which second shapes leave the first, and contact points."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
-        """Return the signed separation [m] of each pair; above `below`, that of the bounding spheres."""
+        """Return each pair's signed separation [m] in each posture; above `below` it is that of bounding spheres."""
         shapes, apart, pair, row = self._near(frames, below)
         return apart.index_put((pair, row), self._separations(shapes, pair, row))
 
@@ -70,7 +70,7 @@ class SelfCollision(Value):
     def pushes(
         self, frames: Float[Tensor, "3 4 l n"], below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
-        """Return the separations, the index of each pair's wrench, and the wrenches: derivatives of the separations.
+        """Return the pairs' separations [m], the index of each pair's wrench, and the wrenches, one in each column.
 
         A wrench is the derivative of a separation by a twist (translation, rotation) of the second shape. The last
         wrench is zero, and belongs to separations above `below`.
@@ -99,7 +99,7 @@ class SelfCollision(Value):
         return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 
     def link_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of links that are tested, as link indices."""
+        """Return the link indices of each pair of links that is tested."""
         links = torch.unique(self.link[self.pairs].sort(1).values, dim=0)
         return [(int(one), int(two)) for one, two in links]
 
@@ -144,7 +144,7 @@ class SelfCollision(Value):
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
     def _split(self, pair: Int[Tensor, " k"]) -> Iterator[tuple[int, slice]]:
-        """Yield each kind among sorted pairs, with the slice of its pairs."""
+        """Yield each kind of pair, named by its number of spheres, with the slice of this kind among sorted pairs."""
         first, second, _ = self.kinds
         ends = torch.searchsorted(pair, torch.tensor([first, first + second], device=pair.device)).tolist()
         for kind, (low, high) in enumerate(itertools.pairwise((0, *ends, len(pair)))):
@@ -152,14 +152,14 @@ class SelfCollision(Value):
                 yield kind, slice(low, high)
 
     def _separations(self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
-        """Return the separations of chosen pairs (sorted) in chosen postures."""
+        """Return the separations [m] of the sorted pairs `pair` in the postures `row`."""
         parts = [self._of_kind(kind, shapes, pair[at], row[at])[0] for kind, at in self._split(pair)]
         return torch.cat(parts) if parts else shapes[1].new_zeros(0)
 
     def _of_kind(
         self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> tuple[Float[Tensor, " k"], Push]:
-        """Return the separations of pairs of one kind, and a function that returns their pushes."""
+        """Return the separations [m] of pairs of one kind, and a function that returns separating directions."""
         (first, second), (one, two), place, gap = self._meet(shapes, pair, row)
         half, radius, bounding = (x.to(gap) for x in (self.half.T, self.radius, self._bounding))
         if kind == 1:
@@ -222,7 +222,8 @@ class BoxPairs(NamedTuple):
     def along_axes(self) -> Float[Tensor, "15 k"]:
         """Return the separations [m] along the 15 candidate axes of two boxes (Gottschalk et al., 1996).
 
-        Own axes come first. The largest separation bounds the distance; below 0 it is minus the shortest way apart.
+        The boxes' own axes come first. The largest separation is a lower bound of the distance; a negative one is minus
+        the shortest translation that separates the boxes.
         """
         a, b, gap, half_a, half_b = self
         rotation = (a[:, :, None] * b[:, None]).sum(0)  # b's axes in the frame of a
@@ -241,7 +242,7 @@ class BoxPairs(NamedTuple):
         return torch.cat([by_a, by_b, torch.where(crossing, by_edges, -torch.inf).flatten(0, 1)])
 
     def push(self, best: Int[Tensor, " k"]) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
-        """Return the axis of index `best`, towards the second box, and the contact point from that box's centre [m]."""
+        """Return the unit vector of axis `best` towards the second box, and the contact point from its centre [m]."""
         a, b, gap, half_a, half_b = self
         best = best[None]
         edges, i = best >= 6, torch.where(best >= 6, (best - 6) // 3, best.clamp_max(2))
@@ -260,7 +261,7 @@ class BoxPairs(NamedTuple):
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the signed distance of points from boxes centred at the origin, negative inside."""
+    """Return the signed distance [m] of points from boxes of `half` sizes around the origin, negative inside."""
     ox, oy, oz = (points.abs() - half).unbind(-1)
     px, py, pz = ox.clamp_min(0), oy.clamp_min(0), oz.clamp_min(0)
     squared = px * px + py * py + pz * pz

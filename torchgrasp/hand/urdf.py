@@ -18,9 +18,9 @@ from torchgrasp.hand.safe_xml import parse_urdf
 from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
 SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
-"""The attributes with the numbers of each kind of shape."""
+"""The attributes that hold the sizes of each kind of shape."""
 REPAIR = "(torchgrasp hand new writes a clean copy)"
-"""The fix for what a published URDF may contain, and a clean URDF may not."""
+"""The end of an error about a published URDF that the library cannot use as it is."""
 
 Triple = tuple[float, float, float]
 
@@ -67,7 +67,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint of the tree; limits are 0 for a fixed joint, and infinite if the URDF has none."""
+    """A joint at `xyz` [m], `rpy` [rad] in its parent; limits are 0 if it is fixed, infinite if the URDF has none."""
 
     name: str
     kind: str
@@ -84,7 +84,7 @@ class Joint:
 
     @property
     def rest(self) -> float:
-        """The position of a parked joint: zero, or the limit next to zero."""
+        """The position of the joint if it does not take part in a grasp: zero, or the limit nearest to zero."""
         return min(max(0.0, self.lower), self.upper)
 
 
@@ -102,7 +102,7 @@ class Urdf:
 
     @checked
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Return the error for a broken rule of the URDF."""
+        """Return the error to raise if the URDF has `found` in place of `allowed`."""
         return HandFileError("urdf", f"{self.path}: {found}", allowed)
 
     @functools.cached_property
@@ -130,7 +130,7 @@ def read_urdf(path: Path | str) -> Urdf:
     """Read and check a URDF file that the library can use.
 
     Raises:
-        HandFileError: as `read_published`; a mesh as a shape, a joint without limits, or a chain of couplings.
+        HandFileError: see `read_published`; a mesh as a shape, a joint without limits, or a chain of couplings.
     """
     urdf = read_published(path)
     for link in urdf.links:
@@ -162,12 +162,12 @@ def read_published(path: Path | str) -> Urdf:
 
 
 def _part(element: ET.Element, tag: str) -> ET.Element:
-    """Return the first child element with a tag, which the safety gate has made sure of."""
+    """Return the first child element with a tag; the checks in `parse_urdf` ensure that there is one."""
     return next(element.iter(tag))
 
 
 def _floats(element: ET.Element, *keys: str) -> list[float]:
-    """Return the numbers of attributes that the safety gate has checked; negative zero becomes zero."""
+    """Return the numbers in attributes that `parse_urdf` has checked; negative zero becomes zero."""
     return [float(word) + 0.0 for key in keys for word in element.attrib[key].split()]
 
 
