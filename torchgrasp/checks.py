@@ -236,7 +236,7 @@ def _has_tensor(hint: Any) -> bool:
 
 @functools.cache
 def _always(kind: type) -> bool:
-    """Return whether values of a class are checked even if the library makes them, because files may give them."""
+    """Return whether a class of values is checked even if the library makes the value, as its numbers may be bad."""
     return hasattr(kind, "__post_init__") or not any(map(_has_tensor, _fields(kind).values()))
 
 

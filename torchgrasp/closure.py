@@ -17,7 +17,7 @@ class ClosingGains(Value):
     """Targets and gains of the closing controller for each finger, in the hand's frame (Eqs. 26-28 of the paper).
 
     `target` [m] is the planned position of a contact, `covariance` [m^2] its uncertainty. `position_gain` [1/s] and
-    `force_gain` [m/(s N)] are diagonals of gain matrices. `desired_force` [N] acts when the hand holds the object.
+    `force_gain` [m/(s N)] are diagonals of gain matrices. `desired_force` [N] is the contact force to reach.
     `force_source` is "analytic", or "stability" if the stability model chose among the balanced forces.
 
     >>> from torchgrasp import closing_gains, load_hand

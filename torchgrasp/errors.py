@@ -38,7 +38,7 @@ class BadArgument(GraspError, ValueError):
 
 
 class TooFewPoints(BadArgument):
-    """A cloud has fewer points than a surface needs."""
+    """A cloud has too few points to estimate a surface."""
 
 
 class SuspiciousScale(BadArgument):
@@ -74,7 +74,7 @@ class OutputError(BadArgument):
 
 
 class MissingExtra(GraspError, ImportError):
-    """A package of an optional extra is not installed; the message names the extra."""
+    """A package that an optional feature needs is not installed; the message names the extra to install."""
 
     def __init__(self, package: str, extra: str):
         super().__init__(f"{package} is not installed: pip install 'torchgrasp[{extra}]'")
@@ -107,7 +107,7 @@ class BrokenLaw(GraspError, AssertionError):
 
 
 class FailedRows(GraspError):
-    """Some rows of a batch failed; raised by `raise_for_status`."""
+    """Some rows of a batch failed; `Batch.raise_for_status` raises this error."""
 
 
 class CloudWarning(UserWarning):

@@ -30,7 +30,7 @@ class PointCloud(Value):
         points: surface points [m], at least 4.
         normals: outward normals of any length, or None.
         viewpoint: position of the camera [m], or of each point's camera; None if it is unknown.
-        frustum: inward unit normals of the four sides of the camera's view, or of each point's; None if unknown.
+        frustum: inward unit normals of the four sides of the camera's view, or of each point's camera; None if unknown.
             An object that reaches a side is cut off there.
 
     Raises:

@@ -175,7 +175,7 @@ def _boxes(corners: list[Corners], axes: np.ndarray) -> list[Shape]:
 
 
 def _cut(points: Points, most: int, saving: float) -> list[Corners]:
-    """Return lower and upper corners of at most `most` boxes that cover the points; a cut must save `saving`."""
+    """Return corners of at most `most` boxes that cover the points; each cut saves the share `saving` of the volume."""
     cells = [(points.min(0), points.max(0), points)]
     while len(cells) < most:
         total = sum(float(np.prod(high - low)) for low, high, _ in cells)

@@ -31,7 +31,7 @@ Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 
 
 class Guess(NamedTuple):
-    """Guessed fingertip pads, the direction to each finger's end in its tip's frame, and that out of the palm."""
+    """Guessed fingertip pads, direction to each finger's end in its tip's frame, and direction out of the palm."""
 
     pads: tuple[Pad, ...]
     outward: tuple[Vector, ...]

@@ -19,7 +19,7 @@ Step = tuple[Urdf, list[str]]
 
 
 def pose_of(part: Joint | Shape) -> np.ndarray:
-    """Return the 4 x 4 pose of a joint or a shape in its parent."""
+    """Return the 4 x 4 pose of a joint or a shape in the frame of its parent link."""
     from trimesh.transformations import compose_matrix
 
     return compose_matrix(angles=part.rpy, translate=part.xyz)
@@ -38,7 +38,7 @@ def place(pose: np.ndarray) -> tuple[Triple, Triple]:
 
 
 def keep_below(urdf: Urdf, root: str) -> Step:
-    """Keep only the link `root` and the links below it, such as the hand on an arm."""
+    """Return the URDF with only the link `root` and the links below it, such as the hand on an arm; also report it."""
     names = {x.name for x in urdf.links}
     if root not in names:
         raise BadArgument("root", repr(root), f"a link of {urdf.path}: {sorted(names)}")
@@ -58,7 +58,7 @@ def keep_below(urdf: Urdf, root: str) -> Step:
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
     """Merge massless links into the links to which they are fixed; last links of a branch with shapes are kept.
 
-    Also return the sentences, and by the name of each merged link the link that now holds it.
+    Also return a sentence about the repair, and a dict from each merged link to the link that took it over.
     """
     taken: dict[str, str] = {}
     while True:

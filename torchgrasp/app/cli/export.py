@@ -77,8 +77,8 @@ class Export(Command):
 class Import(Command):
     """Read grasps of another program, prove which have force closure, and write them as grasps.safetensors.
 
-    `torchgrasp export` and `torchgrasp evaluate --planned` accept the file. Accepted are JSON of `torchgrasp export`,
-    JSON with "pose" and "dofs" (MultiGripperGrasp), and .npz with DexGraspBench's names.
+    `torchgrasp export` and `torchgrasp evaluate --planned` accept the file. The input is JSON of `torchgrasp export`,
+    JSON with "pose" and "dofs" (MultiGripperGrasp), or .npz with DexGraspBench's names.
     """
 
     file: Path = positional("the grasps, in the frame of the object")

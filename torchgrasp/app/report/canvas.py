@@ -154,7 +154,7 @@ def sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Floa
 
 
 def concatenate(parts: list[Triangles]) -> Triangles:
-    """Join several sets of triangles, or none, to one set."""
+    """Join several sets of triangles, or none, into one set."""
     empty = np.zeros((0, 3, 3))
     none = Triangles(empty, empty, empty, np.zeros(0, dtype=bool))
     return Triangles(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
@@ -217,7 +217,7 @@ def _cast(
 
 
 def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return all integers of the ranges [begin, end), each with the index of its range."""
+    """Return for all integers in the ranges [begin, end) the index of the range, and the integer."""
     counts = np.maximum(end - begin, 0)
     owner = np.repeat(np.arange(len(begin)), counts)
     start = np.cumsum(counts) - counts

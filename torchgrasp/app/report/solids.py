@@ -17,7 +17,7 @@ EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot fing
 
 
 class Solid(NamedTuple):
-    """A mesh of one collision shape with vertex normals, the index of its link, and its finger or `PARKED`."""
+    """A mesh of one collision shape with vertex normals, and the indices of its link and finger (or `PARKED`)."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
@@ -65,7 +65,7 @@ def solids_from_hand(
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
-    """Return the index of the finger that each link belongs to; `PARKED` if it belongs to none or several."""
+    """Return by link name the index of the finger that the link belongs to; `PARKED` for no finger or several."""
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
     for mine, name in zip(moves, hand.tree.link_names, strict=True):
