@@ -77,9 +77,9 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
 
 
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each point (n, 3), the closest point on its triangle (n, 3 corners, 3), and where this lies.
+    """Return, for each point (n, 3), the closest point on its triangle (n, 3 corners, 3), and its feature.
 
-    The second result is 0 inside the face, 1 to 3 for the sides ab, bc, ca, and 4 to 6 for the corners a, b, c.
+    The feature is 0 inside the face, 1 to 3 for the sides ab, bc, ca, and 4 to 6 for the corners a, b, c.
     """
     a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     w = points - a

@@ -23,7 +23,7 @@ def assume_noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -
 
 
 class View:
-    """One view: points [m] about their centre, their noise [m], camera position `eye`, and direction `sky` of up."""
+    """One view: points [m] about their centre, their noise [m], camera position `eye`, upward direction `sky`."""
 
     def __init__(
         self, points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None, sky: Float[Tensor, "3"] | None
@@ -34,7 +34,7 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class PlaneFit:
-    """A plane normal . p = offset [m] that holds `count` points; `scale` is their measured over their assumed noise."""
+    """A plane normal . p = offset [m] that holds `count` points; `scale` is the ratio of measured to assumed noise."""
 
     normal: Float[Tensor, "3"]
     offset: float

@@ -42,7 +42,7 @@ class SignedDistanceField(Value):
 
     @checked(gradients=True)
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] at the grid node nearest to each point; outside the grid, at its border."""
+        """Return the signed distance [m] of the grid node nearest to each point, outside the grid of a border node."""
         flat = 0
         for x, low, count in zip(points.unbind(-1), self.origin.to(points), self.values.shape, strict=True):
             node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)

@@ -139,10 +139,10 @@ def find_supports(
 def bound(
     plane: Plane, points: Float[Tensor, "n 3"], on: Bool[Tensor, "n"], eye: Float[Tensor, "3"] | None
 ) -> Support | None:
-    """Return the support on a plane, bounded by the connected points on it, or None if there are too few points.
+    """Return the support on a plane, with its region, or None if too few points lie on the plane (the mask `on`).
 
-    The region is the convex hull of the largest part. Another large part joins it if the camera sees almost nothing
-    below the plane in the area between them: then an object hides that area.
+    The region is the convex hull of the largest connected group of these points. Another large group joins it if the
+    camera `eye` sees almost nothing below the plane between the groups: then an object hides that area.
     """
     if int(on.sum()) < 3:
         return None
@@ -221,7 +221,7 @@ def cross(
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
     """Return where the camera rays through points cross a plane [m], and which points lie behind the plane.
 
-    Without a camera, the points themselves are returned, and points more than `REACH` [m] below the plane do not count.
+    Without a camera, the points themselves are returned, and only points at most `REACH` [m] below count.
     """
     height = plane.height(points)
     if eye is None:

@@ -49,8 +49,9 @@ def longest_distance(x: Float[Tensor, "n 3"]) -> float:
 def append_observations(old: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None) -> Posterior:
     """Return the posterior given the old and the `new` observations; it equals conditioning on all at once.
 
-    The factor L grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
-    `shared` are correlated errors of the new distances, normalised, one column for each independent cause.
+    The Cholesky factor L of the covariance K + noise grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the
+    factor of K(new, new) + noise - B^T B. `shared` are correlated errors of the new distances,
+    normalised, one column for each independent cause.
     """
     kernel = old.kernel
     if shared is not None:

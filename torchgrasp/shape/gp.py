@@ -100,8 +100,8 @@ class ShapeGP(Posterior, Normalisation):
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and covariance at points [m] in the cloud's frame, Eqs. (7)-(8) of the paper.
 
-        The estimate has the dtype of `points`. First derivatives flow back to points that require a gradient, except
-        from `covariance`.
+        Distance, variance and covariance are normalised by `scale` [m]. The estimate has the dtype of `points`. First
+        derivatives flow back to points that require a gradient, except from `covariance`.
 
         Raises:
             BadArgument: non-finite numbers, or a point outside the domain, where a thin plate's variance is negative.

@@ -128,7 +128,7 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
     """Return the vessel after adding observations that give its wall the known thickness.
 
     Two independent surfaces might touch, which tears holes into the wall. In the wall's middle the distances must add
-    up to minus the thickness; otherwise the more certain surface gives an observation of the other.
+    up to minus the thickness; where they do not, the more certain surface gives an observed distance of the other.
     """
     x, thickness, noise = middle.x, middle.thickness, 0.0007 / shape.scale
     for _ in range(3):

@@ -24,7 +24,7 @@ class Posterior(Value):
     Args:
         x: observed points, those with normals first.
         weights: (K + noise)^-1 y for the observed numbers y: first all distances, then the normals by component.
-        factor: lower Cholesky factor of K + noise. Rows of later observations come last, which `x` does not ensure.
+        factor: lower Cholesky factor of K + noise. Rows of later observations come last, unlike in `x`.
         order: for each row of `factor`, its row in `weights`; None if the order is the same.
     """
 
@@ -46,7 +46,7 @@ class Posterior(Value):
 
     @cached_property
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """L^-T of the Cholesky factor L, for fast products: in blocks of columns, without the zeros below."""
+        """The inverse L^-T of the transposed Cholesky factor, in blocks of columns without the zeros below them."""
         rows, tile = len(self.factor), 24  # matrix products are fastest with a multiple of so many columns
         one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)
         inverse = torch.linalg.solve_triangular(self.factor, one, upper=False)
@@ -102,7 +102,7 @@ class Posterior(Value):
 
     @checked
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
-        """Return the mean and the covariance of (d, w) at normalised points, Eqs. (7)-(8) of the paper."""
+        """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of the paper."""
         prior, rows = self.prior_block(), len(self.factor)
 
         def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -141,7 +141,7 @@ class Posterior(Value):
 
     @checked
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of (d, w) at any number of normalised points, Eqs. (7)-(8) of the paper."""
+        """Return the joint posterior of distance and gradient at k normalised points, Eqs. (7)-(8) of the paper."""
         k = len(x)
         cross = self.cross(x)
         mean = (cross @ self.weights).T
@@ -152,7 +152,7 @@ class Posterior(Value):
         return JointEstimate(mean, prior - whitened.T @ whitened)
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
-        """Return the prior covariance (4, 4) of (d, w) at any single point."""
+        """Return the prior covariance (4, 4) of signed distance and gradient, the same at every point."""
         here = self.x.new_zeros(1, 3)
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
 

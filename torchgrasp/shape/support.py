@@ -51,7 +51,7 @@ class Support(Value):
         parts: observed points of the outline and of the hidden side.
         free: points in free space, or None if they are not used.
         rows: mask of the cloud's points that lie on this surface; None means all points.
-        kind: see `ShapeGP`.
+        kind: how the hidden side was completed, as in `ShapeGP`.
     """
 
     frame: Normalisation
@@ -81,10 +81,10 @@ def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
 
 
 def camera_support(seen: PreparedCloud, completion: Completion | None, noise: float, table: float | None) -> Support:
-    """Return observations at metric distances that support the fit.
+    """Return the observations that are added to the points of the cloud, with distances that are true to scale.
 
-    If the cloud is a view with a `completion`, they include its hidden side and free space. `noise` is the
-    standard deviation of the distance observed inside, normalised; `table` is the table's height [m].
+    If the cloud is a view with a `completion`, they include its hidden side and free space. `noise` is the standard
+    deviation of the distance observed inside, normalised; `table` is the table's height [m].
     """
     hidden = seen.points[:0] if completion is None else completion.points.to(seen.points)
     surface = torch.cat([seen.points, hidden])
@@ -114,14 +114,14 @@ def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[P
 
 
 def observe(frame: Normalisation, points: Points, normals: Points, noise: float, normal_noise: float) -> Observations:
-    """Return observations of surface points [m] with normals; `noise` [m] is along the normal."""
+    """Return observations of surface points [m] with normals; `noise` is their deviation [m] along the normals."""
     x = frame.normalise(points.to(frame.center))
     return on_surface(x, normals.to(x), torch.full_like(x[:, 0], noise / frame.scale), normal_noise)
 
 
 @dataclasses.dataclass(frozen=True)
 class Middle(Value):
-    """Points `x` in the middle of a vessel's wall, and its thickness, normalised; off the `side` it may be thicker."""
+    """Points `x` in the middle of a vessel's wall and its thickness, normalised; `side` masks points off the floor."""
 
     x: Points
     side: Bool[Tensor, "n"]
@@ -193,7 +193,7 @@ def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: 
 
 
 def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
-    """Return observations of a wall's hidden points, and their correlated errors."""
+    """Return normalised observations of a wall's hidden points, and their correlated errors."""
     errors = correlated_errors(wall.points, wall.shared, FORM_ERROR)
     return observe(frame, wall.points, wall.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE), errors / frame.scale
 

@@ -43,7 +43,7 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
     """Return `axis_from_cloud`, the transform to a frame whose z axis is an axis of revolution, and the body about it.
 
     Return None if there is no such body. The axis is fitted to sampled points of the scorer. The body, rotated about
-    the axis, must stay out of free space and out of the table.
+    the axis, must stay out of the table and of the space that the cameras saw to be empty.
     """
     center, direction, cost = _fit_axis(*scorer.probes)
     if not cost < MAX_COST:
@@ -80,7 +80,8 @@ def fit_axis(points: Points, normals: Points) -> Float[Tensor, "2"]:
 class _Lines(NamedTuple):
     """Lines along surface normals, seen from above: each line consists of the points x with across . x = offset [m].
 
-    `slope` and `level` are the length and direction of a normal's horizontal part; `steep` masks parts long enough.
+    `slope` and `level` are the length and the direction of a normal's horizontal part. `steep` tells whether this part
+    is long enough for a fit.
     """
 
     slope: Float[Tensor, "n"]

@@ -50,7 +50,7 @@ class Completion(Value):
         shared: standard deviations [m] of the errors that each mirror plane causes.
         asymmetry: standard deviation [m] of a smooth random error, because the object is not quite symmetric.
         planes: the planes n.x = o that were used, as (n, o); for each part of the object, its best plane is first.
-        scores: score of each plane: 1 if the mirror image lies on the cloud, near 0 without support.
+        scores: score of each plane: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it.
         kind: how the hidden side was completed, which selects the calibration.
     """
 

@@ -70,7 +70,7 @@ class SymmetryScorer:
         return SymmetryScorer(points, normals, self.outline.moved(axis_from_cloud), table, True, self.rows)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
-        """Return the scorer with probe points from the given points of the cloud only."""
+        """Return the scorer whose probes are chosen only from the points of the cloud with the indices `rows`."""
         return dataclasses.replace(self, rows=rows[farthest_points(self.points[rows], PROBES, tie=TIE)])
 
     @functools.cached_property
@@ -210,7 +210,7 @@ def _plane_grid(scorer: SymmetryScorer, directions: Directions, count: int = OFF
 
 
 def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: View) -> list[tuple[int, int]]:
-    """Return (direction, offset) in the grid of the best planes that differ in direction and may have hidden images."""
+    """Return (direction, offset) indices of the best planes that differ in direction and may have hidden images."""
     best, offset = scores.max(1)
     hides = _hides(directions, across)
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if hides[i]]

@@ -26,7 +26,7 @@ class Vessel(Value):
     """An open vessel with a vertical axis; lengths in metres.
 
     Args:
-        center: position of the axis.
+        center: position (x, y) of the axis.
         thickness: thickness of the wall, the mean of the fitted and the usual thickness, weighted by certainty.
         radius: outer radius of the mouth.
         rim: height of the mouth.
@@ -46,7 +46,8 @@ def find_vessel(points: Points, normals: Points) -> Vessel | None:
     """Return the open vessel that a cloud shows, or None if it shows no vessel.
 
     Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a cubic polynomial of
-    the height, and the inner radius is less by thickness / slope of the normal. Robust weights (Cauchy) ignore handles.
+    the height, and the inner radius is less by the thickness over the length of the normal's horizontal part. Robust
+    weights (Cauchy) ignore handles.
     """
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     level = normals[:, :2] / slope[:, None].clamp_min(1e-9)
