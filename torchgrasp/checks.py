@@ -158,7 +158,7 @@ def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
 
 
 def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> Any:
-    """Return an argument if it satisfies the rule in its annotation, a range or `RIGID`; else raise `BadArgument`."""
+    """Return an argument if it satisfies the rule in its annotation, such as a range; else raise `BadArgument`."""
     if isinstance(mark, Range):
         return read_number(name, value, hint, mark)
     if mark == ANY and hint is float and isinstance(value, float):
