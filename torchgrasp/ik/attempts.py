@@ -1,4 +1,4 @@
-"""Solvers on fixed contacts: the best seeds of each contact set, then more seeds; the paper's COBYLA solver."""
+"""Grasp solvers on fixed contacts, which refine initial guesses (seeds) in rounds; also the paper's COBYLA solver."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -35,31 +35,31 @@ FAR = 20.0  # clearance [mm] above which clearances are not distinguished
 
 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
-    """Return the contacts of each seed, reordered so that contact i belongs to finger i."""
+    """Return the contact set of each initial guess (seed), reordered so that contact i belongs to finger i."""
     return map_tensors(lambda x: x[seeds.row[:, None], seeds.permutation], contacts)
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined seeds, and a mask of the contact sets that no result `solves`."""
+    """The results of all refined initial guesses (seeds); `unsolved` marks contact sets that no result `solves` yet."""
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
         self.unsolved, self.solves = unsolved, solves
         self.results, self.rows = list[Result](), list[Tensor]()
 
     def add(self, results: Result, row: Int[Tensor, "k"]) -> None:
-        """Add results, with the index of the contact set of each result."""
+        """Add results; `row` holds the index of the contact set of each result."""
         self.results.append(results)
         self.rows.append(row)
         self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
 
     def choose(self, seeds: IKSeeds, rank: Int[Tensor, "g"], first: int, count: int) -> IKSeeds:
-        """Return `count` seeds of each unsolved contact set, from rank `first` on."""
+        """Return, of each unsolved contact set, the seeds whose `rank` is from `first` to `first + count - 1`."""
         return seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
 
     def refine(
         self, seeds: IKSeeds, rank: Int[Tensor, "g"], counts: Sequence[int], refine: Callable[[IKSeeds], Result]
     ) -> None:
-        """Refine the next `counts[k]` seeds of each unsolved contact set in round k, in the order of `rank`."""
+        """In round k, refine the next `counts[k]` seeds (by `rank`) of each unsolved contact set; add the results."""
         first = 0
         for count in counts:
             chosen = self.choose(seeds, rank, first, count)
@@ -68,19 +68,19 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return the best result of each contact set, by `lexical_order` of the keys, and the index of its set."""
+        """Return each contact set's best result (least first key, in a tie least next key), and the set's index."""
         results, row = join(self.results), torch.cat(self.rows)
         first = rank_in_group(row, *keys(results)) == 0
         return results[first], row[first]
 
 
 def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
-    """Return which grasps have passed every check."""
+    """Return a mask of the grasps that passed every check (`Status.OK`)."""
     return grasps.status == Status.OK
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return the best grasp of each set, and the set's index: a success, else a failure on certified contacts."""
+    """Return each contact set's best grasp, and the set's index: a success if any, else a failure on valid contacts."""
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~executable(grasps)
@@ -90,12 +90,12 @@ def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
 
 
 def best_first(grasps: Grasps) -> Grasps:
-    """Sort grasps: executable grasps first, then by decreasing score."""
+    """Return grasps sorted: executable grasps before failed grasps, both by decreasing score."""
     return grasps[lexical_order((~executable(grasps)).int(), -grasps.score)]
 
 
 def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, cobyla: bool = False) -> Grasps:
-    """Refine each seed on its fixed contacts; return checked grasps, with COBYLA by the paper's checks."""
+    """Refine each seed on its fixed contacts; return checked grasps. `cobyla` selects the paper's solver and checks."""
     contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
     if cobyla:
         configuration = refine_by_cobyla(problem.hand, start, contacts, problem.world)
@@ -108,14 +108,14 @@ def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERA
 
 
 def try_best_seeds(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Attempts[Grasps]:
-    """Return the results of refining the first two seeds of each contact set."""
+    """Refine the first two seeds of each contact set onto fixed contacts, and return the results."""
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_in_group(seeds.row), (2,), partial(refine_on_contacts, problem, steps=steps))
     return attempts
 
 
 def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
-    """Return the sum of squared residuals [mm2] of each seed before any refinement."""
+    """Return for each seed the sum of squared errors [mm2] of fingertips and clearances, before any refinement."""
     costs = [seeds.energy[:0]]
     for rows in torch.arange(len(seeds), device=seeds.row.device).split(256):  # their temporaries stay in the cache
         part = seeds[rows]
@@ -127,13 +127,16 @@ def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
 
 
 def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return the rank of each seed among the seeds of its contact set, by `seed_costs`."""
+    """Return the rank of each seed among the seeds of its contact set; rank 0 has the least of the `seed_costs`."""
     return rank_in_group(seeds.row, seed_costs(problem, seeds))
 
 
 @checked
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp on fixed contacts for each contact set with seeds, best first; six seeds are tried."""
+    """Return a checked grasp on fixed contacts for each contact set with seeds, best grasp first.
+
+    Two seeds of each set are refined. If both fail, four more are refined.
+    """
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(seeds, rank_seeds(problem, seeds), (2, 4), partial(refine_on_contacts, problem))
@@ -141,7 +144,7 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
 
 def refine_by_cobyla(hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld) -> Configuration:
-    """Return the configurations at which COBYLA stops; only the joints of the initial configurations are used."""
+    """Move hand configurations onto three contacts each by SciPy's COBYLA; the poses in `start` are not used."""
     if not len(start):
         return start
     rows = [CobylaRun(hand, q, p, world).solve() for q, p in zip(start.joints, contacts.points, strict=True)]
@@ -149,7 +152,7 @@ def refine_by_cobyla(hand: Hand, start: Configuration, contacts: Contacts, world
 
 
 class CobylaRun:
-    """One run of COBYLA from initial `joints` onto three contact points; the last values are cached for SciPy."""
+    """One run of SciPy's COBYLA from initial `joints` [rad] onto three contact `points` [m]; caches the last values."""
 
     def __init__(self, hand: Hand, joints: Float[Tensor, "h"], points: Float[Tensor, "3 3"], world: CollisionWorld):
         self.hand, self.world = hand, world
@@ -160,7 +163,7 @@ class CobylaRun:
         self.last: tuple[bytes, float, np.ndarray] | None = None
 
     def place(self, x: np.ndarray) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
-        """Return joints within limits, link frames in the hand, the pose of Eq. (24), and whether the pose exists."""
+        """Return joints within limits, link frames in the hand, the hand's pose (Eq. 24), whether the pose exists."""
         step = ANGLE * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
         joints = (self.first + step).clamp(self.hand.lower.to(step), self.hand.upper.to(step))
         frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())
@@ -184,7 +187,7 @@ class CobylaRun:
         return self.last[1:]
 
     def clearances(self, frames: Float[Tensor, "3 4 l 1"], pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, ""]]:
-        """Return clearances [m] between links, of palm, fingers and tips from the object, from table and obstacles."""
+        """Return the least clearances [m]: between links; of palm, fingers, tips from object; from table, obstacles."""
         spheres, radius = self.hand.collision_spheres, self.hand.collision_spheres.radius.to(pose)
         local = map_points(frames.index_select(2, spheres.link_index), spheres.center)[..., 0].T
         centres = apply(pose, local)
@@ -219,9 +222,9 @@ class CobylaRun:
 
 
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return the paper's grasps: a checked grasp for each contact set that was tried, best first.
+    """Find grasps as in the paper: return a checked grasp for each contact set that was tried, best grasp first.
 
-    Contact sets are tried five at a time, with two seeds each, until 10 are executable or 30 were tried.
+    Contact sets are tried five at a time, with two seeds each, until 10 grasps are executable or 30 sets were tried.
     """
     seeds = problem.drop_unreachable(seeds)
     attempts, rows = Attempts(torch.ones_like(problem.certificate.closed), executable), seeds.row.unique()
@@ -235,7 +238,7 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
 
 def _rank(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return the rank of each seed among the seeds of its contact set, by the depth of its deepest collision."""
+    """Return the rank of each seed among the seeds of its contact set; rank 0 has the least deep collision."""
     contacts, still = assign(problem.contacts, seeds), np.zeros(problem.hand.dof)
     runs = [CobylaRun(problem.hand, q, p, problem.world) for q, p in zip(seeds.joints, contacts.points, strict=True)]
     deepest = [max(0.0, -float(run.evaluate(still)[1].min())) for run in runs]

@@ -23,23 +23,23 @@ from torchgrasp.plan.feasibility import first_violation
 from torchgrasp.values import Certificate, Contacts, Grasps, IKSeeds
 
 Reachable = Callable[[Tensor], Tensor]
-"""Returns which poses obj_from_hand (k, 4, 4) an arm reaches, as booleans (k,)."""
+"""A user's function that takes hand poses in the object's frame (k, 4, 4), and returns which an arm reaches (k,)."""
 PAPER_TOLERANCE = 10 * MILLIMETRE  # the paper's largest distance [m] of a tip from its contact: about a tip's radius
 TIP_TOLERANCE, TIP_PENETRATION = 1 * MILLIMETRE, 2 * MILLIMETRE
-"""Largest distance [m] of a tip from its contact, and largest depth of a tip in the estimated surface."""
+"""Largest distance [m] of a tip from its contact, and largest depth [m] of a tip below the estimated surface."""
 ANGLE_TOLERANCE = math.radians(2)  # largest angle [rad] of a contact direction outside the pad's cone
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """The input of a grasp solver: a hand, certified contact sets and the collision world.
+    """The input of a grasp solver: a hand, contact sets with certificates of force closure, and the collision world.
 
-    Grasps around `center`, the object's centre [m], score higher. `reachable` says which hand poses an arm can reach;
-    None means every pose.
+    Grasps near `center`, the object's centre [m], score higher. The function `reachable` tells which hand poses an arm
+    can reach; without this function, every pose counts as reachable.
 
     Raises:
-        BadArgument: contacts without `std_m`, by which the pre-grasp opens.
+        BadArgument: the contacts lack `std_m`, the surface's standard deviation, by which the pre-grasp opens.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -61,12 +61,12 @@ class GraspProblem(Value):
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
-        """Return the seeds whose poses are reachable."""
+        """Return the seeds whose hand poses the arm can reach."""
         return seeds if self.reachable is None else seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]
 
 
 def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
-    """Return which poses the user's callable reports as reachable; raise `BadArgument` for any other answer."""
+    """Return a mask of the hand poses that the user's function accepts; raise `BadArgument` for a malformed answer."""
     if not len(obj_from_hand):
         return torch.zeros(0, dtype=torch.bool, device=obj_from_hand.device)
     answer = reachable(obj_from_hand)
@@ -78,7 +78,10 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Candidate configurations in which finger i touches contact `permutation[:, i]` of its contact set."""
+    """Hand configurations to be checked, with contacts, certificates, and the `status` of contact planning.
+
+    Finger i touches contact `permutation[:, i]` of the planned contact set. `contacts` are in the order of the fingers.
+    """
 
     configuration: Annotated[Configuration, Rows("g")]
     contacts: Annotated[Contacts, Rows("g")]
@@ -90,7 +93,10 @@ class GraspCandidates(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
-    """Geometric errors of grasps; see the fields of `Grasps`."""
+    """Errors of g grasps: each tip's distance from its contact [m], and the contact's angle from the pad's axis [rad].
+
+    `clearance` [m] is the least clearance of the links. `status` tells the first error out of tolerance.
+    """
 
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
     normal_angle: Annotated[Float[Tensor, "g f"], ANY]
@@ -107,10 +113,11 @@ def measure_errors(
     rolling: bool = True,
     tolerance: Length = TIP_TOLERANCE,
 ) -> GraspErrors:
-    """Measure geometric errors of grasps; `status` is the first error out of tolerance, NaN included.
+    """Measure the errors and clearances of grasps; `status` tells the first error out of tolerance.
 
-    With `rolling`, round fingertips may roll on their contacts within the cones of their pads. Without, as in the
-    paper, the contact points of the pads are measured and their direction is free. `tolerance` is that of the tips [m].
+    With `rolling`, round fingertips may roll on their contacts within the cones of their pads. Without `rolling`, as in
+    the paper, each pad must touch with its own contact point, in any direction. `tolerance` [m] is the largest allowed
+    distance of a tip from its contact. NaN is out of tolerance.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     touching, target = hand.tips.contact, contacts.points
@@ -140,7 +147,7 @@ def measure_errors(
 
 
 def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Return which hands touch neither object nor table nor themselves, fingertips included."""
+    """Return a mask of the configurations in which no link, tips included, touches object, table or another link."""
     links, _, table = link_clearance(SpatialJacobian.at(hand, configuration), world, tips_touch=False)
     return (links >= 0) & (table >= 0) & (hand.self_clearance(configuration.joints) >= 0)
 
@@ -149,7 +156,10 @@ def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) ->
 def check_candidates(
     problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
 ) -> Grasps:
-    """Return checked grasps (`measure_errors`); faultless grasps also get a pre-grasp and an approach direction."""
+    """Check candidates by `measure_errors`, and return one grasp for each, with the `Status` of the first failed check.
+
+    A grasp without errors also gets a pre-grasp and an approach direction.
+    """
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed
@@ -192,7 +202,7 @@ def check_candidates(
 def _keep_clear(
     problem: GraspProblem, configuration: Configuration, opened: Configuration, approach: Tensor, status: Tensor
 ) -> None:
-    """Set in place the status of grasps that collide with obstacles; soft obstacles only change the approach."""
+    """Change in place the `status` of grasps that collide with hard obstacles; soft ones change only the `approach`."""
     hand, world = problem.hand, problem.world
     crowded = torch.nonzero(status == Status.NO_APPROACH)[:, 0]
     direction, clearance = find_approach(hand, opened[crowded], world.alone)

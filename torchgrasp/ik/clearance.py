@@ -26,12 +26,13 @@ HINGES = 8  # number of least clearances of each kind that enter one step
 @checked
 @dataclasses.dataclass(frozen=True)
 class Obstacles(Value):
-    """Regions of a scene that are occupied with a given probability, as distance fields [m].
+    """Regions of a scene that are probably occupied, given as grids of the distance [m] from these regions.
 
     Args:
-        field: signed distances from the region that counts as occupied.
-        distances: unsigned distances from the regions of at least each of the `levels`, on the same grid.
-        levels: probabilities, ascending.
+        field: signed distances from the region that counts as occupied, negative inside.
+        distances: for each of the `levels`, the distances from the region that is occupied with at least this
+            probability; 0 inside, on the same grid.
+        levels: k probabilities, ascending.
         hard: whether links must not touch the occupied region; otherwise a collision only lowers the predicted success.
 
     >>> from torchgrasp import load_scene
@@ -48,7 +49,9 @@ class Obstacles(Value):
     @classmethod
     @checked
     def of(cls, occupancy: Occupancy, full: float = 0.3, hard: bool = True) -> "Obstacles | None":
-        """Return the voxels of a grid with probability `full` or more as obstacles, or None if there are none.
+        """Return the obstacles of an occupancy grid, or None if all its voxels are probably free.
+
+        Voxels of probability `full` or more count as occupied.
 
         Raises:
             BadArgument: `full` outside [0.01, 1].
@@ -65,7 +68,7 @@ class Obstacles(Value):
 
     @checked(gradients=True)
     def likelihood(self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]) -> Float[Tensor, "*b"]:
-        """Return, for each set of spheres [m], the largest occupancy probability of the regions that they touch."""
+        """Return for each set of s spheres [m] the largest occupancy probability of the regions that they touch."""
         met = centres.new_zeros(centres.shape[:-2])
         levels = [*self.levels.tolist(), 1.0]
         for low, high, values in zip(levels, levels[1:], self.distances, strict=False):
@@ -75,7 +78,7 @@ class Obstacles(Value):
 
 
 def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
-    """Return the distance [m] of each voxel from a region; 0 inside, larger than the grid for an empty region."""
+    """Return the distance [m] of each voxel from a region: 0 inside, larger than the grid if the region is empty."""
     from scipy.ndimage import distance_transform_edt
 
     if not bool(region.any()):
@@ -87,7 +90,9 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """What the hand must not touch: the object as a signed distance field, a table, and obstacles; each may be None.
+    """The surroundings that a hand must not touch: the object's signed distance `field`, a table, and obstacles.
+
+    The table is a plane, or a height [m] along z. A part of the surroundings that does not exist is None.
 
     Raises:
         BadArgument: a table that is neither a plane nor a height.
@@ -105,7 +110,7 @@ class CollisionWorld(Value):
 
     @cached_property
     def plane(self) -> Plane | None:
-        """The table as a plane, on the device of the fields."""
+        """The table as a plane, on the device of the distance fields, or None without a table."""
         plane = as_plane(self.table)
         return plane if plane is None or not self.fields else settle(plane, self.fields[0].origin.device)
 
@@ -133,7 +138,7 @@ def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
-    """Return the sum of squared missing clearances [mm2] of a hand whose fingertips may touch the object."""
+    """Return for each hand the sum of squares [mm2] of the clearance its spheres lack; tips may touch the object."""
     radius, cost = spheres.radius.to(centres), centres.new_zeros(centres.shape[:-2])
     for field in world.fields:
         deficit = CLEARANCE + radius - field.nearest_node(centres)
@@ -146,7 +151,7 @@ def collision_cost(
 
 
 def clearance_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
-    """Return residuals for the smallest clearances: between links, from object, obstacles and table."""
+    """Return residuals [mm]: the lack of the smallest clearances between links and from object, obstacles and table."""
     pairs, moves = spatial.hand.self_collision, spatial.hand.motion.moves
     separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
     separation, index = separation.T.topk(min(HINGES, len(pairs.pairs)), dim=1, largest=False, sorted=False)
@@ -157,7 +162,7 @@ def clearance_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: 
 
 
 def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
-    """Return residuals for the smallest clearances of the links' spheres from object, obstacles and table."""
+    """Return the residuals of `clearance_rows` for the clearances of the links from object, obstacles and table."""
     spheres, motion, centres = spatial.hand.collision_spheres, spatial.hand.motion, spatial.sphere_centres
     radius, found = spheres.radius.to(centres), []
     for field in world.fields:
@@ -190,7 +195,7 @@ def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: boo
 
 
 def link_clearance(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Float[Tensor, "g"]]:
-    """Return least clearances [m]: links from the object, touching tips from the object, all from the table."""
+    """Return each hand's least clearances [m]: links (no tips if `tips_touch`) and tips from object, all from table."""
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres
     radius = spheres.radius.to(centres)

@@ -24,16 +24,16 @@ from torchgrasp.hand.kinematics import map_points
 @checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
-    """Joints [rad] and pose of a free-floating hand."""
+    """Configurations of a free-floating hand: its joints [rad] and its pose in the object's frame."""
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Poses
 
     @checked(gradients=True)
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "Configuration":
-        """Return the configuration after a step of translation [m], rotation vector and joints, within the limits.
+        """Return the configurations after a `step`: translation [m], then rotation vector [rad], then joints [rad].
 
-        Translation and rotation vector are in the hand's axes.
+        Translation and rotation vector are in the hand's axes. The joints are clamped to their limits.
         """
         if step.shape[1] != 6 + self.joints.shape[1]:
             raise BadArgument("step", f"{step.shape[1]} numbers", f"6 of the pose and {self.joints.shape[1]} joints")
@@ -44,7 +44,10 @@ class Configuration(Batch):
 
 
 class Rows(NamedTuple):
-    """Residuals with their derivatives: `wrench` times the twist of each motion for which `moves` is 1."""
+    """Residuals of g configurations, with the factors of their derivatives by q motions of joints and hand pose.
+
+    The derivative by a motion is `wrench` times the twist of the motion where `moves` is 1, and 0 where `moves` is 0.
+    """
 
     residual: Float[Tensor, "g k"]
     wrench: Float[Tensor, "g k 6"]
@@ -53,7 +56,7 @@ class Rows(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """Link frames, sphere centres, fingertips, pad axes and motion twists of a hand, in the object's frame."""
+    """Link frames, sphere centres, tip centres, pad axes and motion twists of g hands, in the object's frame."""
 
     hand: Hand
     obj_from_link: Float[Tensor, "3 4 l g"]
@@ -64,7 +67,7 @@ class SpatialJacobian(Value):
 
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
-        """Evaluate the kinematics at configurations; Jacobians follow from the result."""
+        """Evaluate the forward kinematics of a hand at g configurations; the result can compute Jacobians."""
         root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
         frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
         spheres, tips, pads, origins, turning, sliding = hand.motion.place(frames)
@@ -72,7 +75,7 @@ class SpatialJacobian(Value):
         return cls(hand, frames, spheres, tips, pads, twists)
 
     def points(self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]) -> Float[Tensor, "g k 3"]:
-        """Return points [m] that are fixed in links, in the object's frame."""
+        """Return the positions [m] in the object's frame of k points, each given in the frame of its link."""
         return map_points(self.obj_from_link.index_select(2, links), local).permute(2, 1, 0)
 
     @property
@@ -81,13 +84,13 @@ class SpatialJacobian(Value):
         return self.spheres.permute(2, 1, 0)
 
     def jacobian(self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of residuals by pose and joints; the arguments are fields of `Rows`."""
+        """Return the derivatives of k residuals by hand pose (6) and joints; the arguments are fields of `Rows`."""
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling
         return by_motion if coupling is None else by_motion @ coupling.to(by_motion)
 
 
 def differentiate(spatial: SpatialJacobian, parts: Sequence[Rows]) -> Residuals:
-    """Return the residuals of all parts, concatenated, and their Jacobian by pose and joints."""
+    """Concatenate several groups of residuals; return them and their Jacobian by hand pose (6) and joints."""
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     return residual, spatial.jacobian(wrench, moves)

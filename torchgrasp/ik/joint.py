@@ -1,7 +1,8 @@
 """Contacts, hand pose and joints solved together: the contacts slide on the surface until the hand reaches them.
 
-The contact problem (Eqs. 10-13 and the margins of `ContactSpec`) and the hand's residuals form one least-squares
-problem. Its unknowns are pose, joints, contact points and tensions between contacts.
+The contact problem (Eqs. 10-13 of the paper, with the margins of `ContactSpec`) and the hand's residuals form one
+least-squares problem. Its unknowns are pose, joints, contact points and tensions. A tension is the size of the pull
+between two contacts; the pulls give the contact forces.
 """
 
 import dataclasses
@@ -34,7 +35,7 @@ CONTACT_WEIGHT = 2.0  # weight of a millimetre of the contact problem: contacts 
 
 
 class Stage(NamedTuple):
-    """A solver stage: its steps, whether flatness is required, and the cost [mm2] above which a grasp is dropped."""
+    """A solver stage: its steps, whether contacts must be on flat surface, largest cost [mm2] of grasps that go on."""
 
     steps: int
     flat: bool
@@ -46,7 +47,7 @@ STAGES = (Stage(5, False, 1e5), Stage(6, True, 1e4), Stage(7, True, 500.0), Stag
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """Hand configurations, normalised contacts and tensions; the variance is extrapolated from the stage's start."""
+    """Hand configurations, contact points (normalised), tensions; `variance` is extrapolated from the stage's start."""
 
     configuration: Configuration
     points: Float[Tensor, "g f 3"]
@@ -55,7 +56,7 @@ class JointState(Batch):
     variance_gradient: Float[Tensor, "g f 3"]
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "JointState":
-        """Return the state after a step of all unknowns."""
+        """Return the state after a `step`: changes of hand pose, joints, contact points and tensions, concatenated."""
         by_hand, by_points, by_tension = step.split([6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1)
         motion = by_points.unflatten(1, self.points.shape[1:])
         points, variance = self.points + motion, self.variance + (self.variance_gradient * motion).sum(-1)
@@ -66,7 +67,7 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """The joint problem of one hand, object and collision world, with contacts that satisfy `spec`."""
+    """The least-squares problem of hand and contacts together: hand, object shape, contact specification, world."""
 
     hand: Hand
     shape: Shape
@@ -75,7 +76,7 @@ class JointProblem:
 
     @cached_property
     def contact_problem(self) -> ContactProblem:
-        """The contact planning problem, without the hand."""
+        """The constraints on the contacts alone, without the hand."""
         return ContactProblem.of(self.shape, self.spec)
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
@@ -100,7 +101,7 @@ class JointProblem:
     def _tips_by_points(
         self, spatial: SpatialJacobian, jet: SurfaceJet, outside: Bool[Tensor, "g f"]
     ) -> Float[Tensor, "g 4*f 3*f"]:
-        """Return the Jacobian of the fingertip residuals by the contact points; pads count only `outside` cones."""
+        """Return the derivatives of tip residuals by contact points; `outside` marks contacts outside pads' cones."""
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity, own = (torch.eye(k, dtype=normals.dtype, device=normals.device) for k in (3, len(hand.tips)))
         target = float(self.shape.scale) * identity + hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
@@ -111,7 +112,7 @@ class JointProblem:
         return torch.cat([-TIP_WEIGHT / MILLIMETRE * tips, PAD_WEIGHT * tilts], 1)
 
     def _contact_residuals(self, state: JointState, jet: SurfaceJet, flat: FlatnessConstraint | None) -> Residuals:
-        """Return the residuals [mm] of the contact problem; zero where a bound is satisfied."""
+        """Return the residuals [mm] of the contacts alone, and their Jacobian; a satisfied inequality gives 0."""
         rows = self.contact_problem.constraints(state.points, state.tension, jet)
         bounds, bounds_by_x = rows.bounds, rows.bounds_by_x
         if flat is not None:
@@ -127,7 +128,7 @@ class JointProblem:
     def solve(
         self, configuration: Configuration, points: Float[Tensor, "g f 3"]
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
-        """Return configurations, normalised contacts and their indices; grasps of high cost are dropped."""
+        """Optimise hands and contacts together; return configurations, contacts and indices of grasps of low cost."""
         largest, radius = self.spec.flatness, self.spec.ring_radius
         rows, tension = torch.arange(len(points), device=points.device), equal_tensions(points)
         for stage in STAGES:
@@ -152,7 +153,7 @@ class JointProblem:
 def solve_sliding(
     problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec, attempts: Attempts[Grasps]
 ) -> None:
-    """Add results with sliding contacts to `attempts`, for each unsolved contact set."""
+    """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps to `attempts`."""
     joint_problem = JointProblem(problem.hand, shape, spec, problem.world)
     count = 8 if len(problem.hand.tips) == 3 else 2
     chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, count)

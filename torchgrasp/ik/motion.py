@@ -24,9 +24,10 @@ Spheres = Float[Tensor, "g s 3"]
 def find_approach(
     hand: Hand, opened: Configuration, world: CollisionWorld
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
-    """Return an approach direction for each pre-grasp, and the least clearance [m] along its path.
+    """Return for each opened hand the direction of a straight approach, and the least clearance [m] on its path.
 
-    Of the candidates, sorted by approximate clearance, the first without a collision is chosen, or else the clearest.
+    Candidate directions are tried by falling approximate clearance. The first direction without a collision is chosen;
+    if there is none, the direction of the largest clearance.
     """
     spheres = hand.collision_spheres
     centres = SpatialJacobian.at(hand, opened).sphere_centres
@@ -43,7 +44,7 @@ def find_approach(
 
 
 def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) -> Float[Tensor, "g k 3"]:
-    """Return the candidate approach directions in the object's frame."""
+    """Return k candidate approach directions in the object's frame: the hand's axis, tilted axes, down onto a table."""
     pose = opened.obj_from_hand
     axis = unit(hand.approach.to(pose))
     first, second = across(axis)
@@ -60,7 +61,7 @@ def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) 
 def _clearance(
     centres: Spheres, radius: Float[Tensor, "s"], direction: Float[Tensor, "g 3"], world: CollisionWorld, exact: bool
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of spheres on a straight path to the pre-grasp, `exact` or by nearest nodes."""
+    """Return the least clearance [m] of a hand's spheres on its approach path, `exact` or by the nearest grid nodes."""
     steps = FINE_STEPS if exact else COARSE_STEPS
     back = torch.arange(1, steps + 1, dtype=centres.dtype, device=centres.device) * (APPROACH_DISTANCE / steps)
     path = (centres[:, None] - back[:, None, None] * direction[:, None, None]).flatten(1, 2)
@@ -81,7 +82,7 @@ def _clearance(
 def motion_clearance(
     hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"], world: CollisionWorld
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] from obstacles while the hand closes and lifts."""
+    """Return the least clearance [m] of each hand from obstacles while the hand closes and is lifted."""
     assert world.obstacles is not None
     up = UP if world.plane is None else world.plane.normal
     centres = torch.cat([_closing(hand, configuration, pregrasp), _lift(hand, configuration, up)], 1)
@@ -90,9 +91,10 @@ def motion_clearance(
 
 @checked
 def collision_probability(hand: Hand, grasps: Grasps, obstacles: Obstacles) -> Float[Tensor, "g"]:
-    """Return the probability that the hand collides during approach, closing and lift along z: that of any swept voxel.
+    """Return for each grasp the probability that the hand hits an obstacle during approach, closing and lift along z.
 
-    Hidden voxels behind one object are occupied or free together, so the largest probability counts.
+    This is the largest occupancy probability of the voxels that the hand sweeps, because hidden voxels behind one
+    object are occupied or free together.
     """
     configuration = Configuration(grasps.joints, grasps.obj_from_hand)
     opened = _centres(hand, Configuration(grasps.pregrasp, grasps.obj_from_hand))
@@ -106,7 +108,7 @@ def collision_probability(hand: Hand, grasps: Grasps, obstacles: Obstacles) -> F
 
 @checked
 def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> float:
-    """Return the clearance [m] of the object's surface, lifted along z; far below 0 if an obstacle lies on it."""
+    """Return the least clearance [m] of the lifted object from obstacles; far below 0 if an obstacle lies on it."""
     return float(obstacles.field.query(_lifted(vertices, UP))[0].min()) if len(vertices) else math.inf
 
 
@@ -123,7 +125,7 @@ def _lift(hand: Hand, configuration: Configuration, up: Float[Tensor, "3"]) -> F
 
 
 def _lifted(points: Float[Tensor, "*b 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "k *b 3"]:
-    """Return points [m] at six heights of a 0.1 m lift."""
+    """Return points [m] at six heights of a lift by 0.1 m along `up`."""
     height = torch.arange(1, 7).to(points) * (0.1 / 6)
     return points + (height[:, None] * up.to(points)).reshape(-1, *[1] * (points.ndim - 1), 3)
 

@@ -34,11 +34,11 @@ FEATURES = (
 """The features of the model of success, in this order."""
 LEAST_ARM = 0.1  # added to the load's arm over the triangle's height, so that its logarithm is finite
 MODEL = Path(__file__).with_name("success.json")
-"""Weights and bias of the model, the range [m] in which trials or lifts support it, and what both were."""
+"""File of the success model: weights, biases, the range that trials or lifts support, and notes on these tests."""
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the indices that sort rows by the first key, ties by the next key."""
+    """Return the indices that sort rows ascending by the first key; ties are sorted by the next key."""
     order = torch.argsort(keys[-1], stable=True)
     for key in reversed(keys[:-1]):
         order = order[torch.argsort(key[order], stable=True)]
@@ -46,7 +46,7 @@ def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the rank of each row within its group, by `lexical_order` of the keys."""
+    """Return the rank (from 0) of each row in its group, sorted ascending by the first key, ties by the next key."""
     order = lexical_order(group, *keys)
     grouped = group[order].contiguous()
     rank = torch.empty_like(order)
@@ -55,7 +55,7 @@ def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the friction needed by forces towards the contacts' centroid: the largest over the contacts."""
+    """Return the friction coefficient that each contact set needs if all forces point to the contacts' centroid."""
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
     sine = torch.linalg.vector_norm(torch.linalg.cross(inward, contacts.normals), dim=-1)
@@ -63,15 +63,19 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
 
 
 def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
-    """Return minus a weighted sum of distance from the centre, friction needed, and angle between pad and contact."""
+    """Return the geometric score of each grasp, at most 0; a higher score is better.
+
+    Three things lower it: the contacts' distance from `center` [m], the friction needed, and the angle off the pads.
+    """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(offset / 0.02 + centred_friction(contacts) + normal_angle.amax(1) / 0.8)
 
 
 def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
-    """Return the lever arm of a load at `center` about the longest side of the contacts' triangle, over its height.
+    """Return the distance of `center` [m], where the load acts, from the longest side of the contacts' triangle.
 
-    The object turns most easily about this side. If there are more than three contacts, the best three count.
+    The distance is divided by the triangle's height over this side, about which the object turns most easily. For more
+    than three contacts, the triangle of the smallest ratio counts.
     """
     if points.shape[1] > 3:
         triples = torch.tensor(list(itertools.combinations(range(points.shape[1]), 3)), device=points.device)
@@ -86,9 +90,9 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
 
 
 def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
-    """Return the lever [m] of each finger's joints about the normal of its contact: the norm of their moment arms.
+    """Return each finger's lever [m]: the norm of its joints' moment arms for a force along the contact's normal.
 
-    If the surface is off by e, the force of a finger with joints of stiffness k is off by k e / lever^2.
+    If the surface is displaced by e, the force of a finger whose joints have stiffness k changes by k e / lever^2.
     """
     joints = grasps.joints
     hand_from_obj, coupling = inverse(grasps.obj_from_hand.to(joints)), hand.actuated.coupling.to(joints)
@@ -100,7 +104,7 @@ def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
 def success_features(
     hand: Hand, shape: ShapeGP, grasps: Grasps, center: Float[Tensor, "3"], friction: float, seed: int = 0
 ) -> Float[Tensor, "g k"]:
-    """Return the `FEATURES` of each grasp, input of the success model; `center` [m] is the estimated centre of mass."""
+    """Return the success model's inputs `FEATURES` for each grasp; `center` [m] is the estimated centre of mass."""
     contacts = grasps.contacts
     points, normals = contacts.points.to(shape.x), contacts.normals.to(shape.x)
     center = center.to(points)
@@ -120,40 +124,46 @@ def _read_model() -> dict[str, Any]:
 
 
 def success_log_odds(features: Float[Tensor, "g k"], hand: str) -> Float[Tensor, "g"]:
-    """Return the log-odds of success of grasps with the named hand. A hand without trials gets the least bias."""
+    """Return the predicted log-odds of success of each grasp; a hand without trials gets the lowest bias of all."""
     model = _read_model()
     bias = model["bias"].get(hand, min(model["bias"].values()))
     return features @ features.new_tensor([model["weights"][name] for name in FEATURES]) + bias
 
 
 def is_known(shape: ShapeGP, grasps: Grasps, friction: float) -> Bool[Tensor, "g"]:
-    """Return for which grasps trials or lifts support the prediction: by friction, size, deviation at contacts."""
+    """Return a mask of the grasps whose predicted success is supported by trials or lifts of similar grasps.
+
+    Friction, object size and the surface's standard deviation at the contacts must be in the range that was tried.
+    """
     tried = _read_model()["range"]
     alike = friction >= tried["least_friction"] and tried["half_size"][0] <= shape.scale <= largest_known()
     return alike & (grasps.contacts.require_std().amax(1) <= tried["most_deviation"])
 
 
 def largest_known() -> float:
-    """Return the largest distance [m] from an object's centre to its surface, of objects whose success is known."""
+    """Return the largest half size [m] (distance from centre to surface) of the objects that support predictions."""
     return _read_model()["range"]["half_size"][1]
 
 
 def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:
-    """Return grasps scored by the log-odds of the k executable grasps, in the order of `by_success`."""
+    """Set the scores of the k executable grasps to their log-odds of success, and return all grasps, best first."""
     failed, scores = grasps.status != Status.OK, grasps.score.clone()
     scores[~failed] = log_odds.to(scores)
     return by_success(dataclasses.replace(grasps, score=scores))
 
 
 def by_success(grasps: Grasps) -> Grasps:
-    """Return executable grasps of known success first, then of unknown success, then failures, by falling score."""
+    """Sort grasps: executable grasps with a supported prediction, other executable grasps, then failed grasps.
+
+    Each of the three groups is sorted by falling score.
+    """
     late = 2 * (grasps.status != Status.OK).int()
     late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()
     return grasps[lexical_order(late, -grasps.score)]
 
 
 def rank_by_variance(grasps: Grasps) -> Grasps:
-    """Sort grasps: executable ones first, by increasing sum of their contacts' variances (Sec. 6.5)."""
+    """Sort grasps: executable grasps first, then by increasing sum of the surface variances at contacts (Sec. 6.5)."""
     if grasps.contacts.variance is None:
         raise BadArgument("grasps.contacts.variance", "None", "the variance of the surface at each contact")
     return grasps[lexical_order((grasps.status != Status.OK).int(), grasps.contacts.variance.sum(1))]

@@ -1,7 +1,7 @@
 """Refinement of hand configurations onto contacts and away from collisions, by batched Levenberg-Marquardt.
 
-The centre of a round fingertip is one radius away from its contact, so that the tip may roll. Other tips touch with
-their contact points. The contact direction stays inside a cone about the pad's axis.
+The centre of a round fingertip is one radius away from its contact, so that the tip may roll. Fingertips of other
+shapes touch with a fixed point. The contact direction stays inside a cone about the pad's axis.
 """
 
 import torch
@@ -20,12 +20,12 @@ ITERATIONS = 30  # most steps of one refinement
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
-    """Return where the fingertip centres [m] (`Hand.tip_centres`) must be to touch their contacts."""
+    """Return the positions [m] of the fingertip centres when the tips touch: one radius from the contacts."""
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
 
 def tip_rows(spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]) -> Rows:
-    """Return the residuals of fingertips: three of each tip's position, then one of each contact direction."""
+    """Return the fingertips' residuals: three for each tip's position error, then one for each contact direction."""
     tips, motion, g = spatial.hand.tips, spatial.hand.motion, len(target)
     centres, pads = spatial.tips.permute(2, 1, 0), spatial.pads.permute(2, 1, 0)
     outside = tips.cone.cos().to(pads) + (pads * normals).sum(-1)  # the contact direction is the inward normal
@@ -47,7 +47,10 @@ def grasp_residuals(
     world: CollisionWorld | None,
     tips_touch: bool,
 ) -> Residuals:
-    """Return the residuals of fingertip positions, pad directions and, if there is a world, clearances."""
+    """Return the residuals of tip positions, pad directions and, with a `world`, clearances; and their Jacobian.
+
+    `target` holds the wanted tip centres [m]. With `tips_touch` the fingertips may touch the object.
+    """
     spatial = SpatialJacobian.at(hand, configuration)
     links = [] if world is None else clearance_rows(spatial, world, tips_touch)
     return differentiate(spatial, [tip_rows(spatial, target, normals), *links])
@@ -61,9 +64,9 @@ def refine(
     solved: float = SOLVED,
     steps: int = ITERATIONS,
 ) -> Configuration:
-    """Return configurations in which finger i touches contact i and, with a world, links are clear, if possible.
+    """Move hand configurations until finger i touches contact i and, with a `world`, links are clear, if possible.
 
-    A configuration is done when its sum of squared residuals [mm2] is below `solved`.
+    A configuration is done when its sum of squared residuals [mm2] is below `solved`, or after `steps` steps.
     """
     target, normals = tip_targets(hand, contacts), contacts.normals
 
@@ -75,7 +78,7 @@ def refine(
 
 
 def open_hand(hand: Hand, grasp: Configuration, contacts: Contacts, world: CollisionWorld) -> Float[Tensor, "g h"]:
-    """Return the joints of the pre-grasp: each tip is moved off its contact along the normal; links are clear."""
+    """Return the joints [rad] of the opened hand: each tip moves off its contact along the normal; links keep clear."""
     normals, gap = contacts.normals, 0.012 + 3.0 * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
     if world.plane is not None:

@@ -32,7 +32,9 @@ WRONG_SIDE = 0.3  # mean cosine of the outward normals of tips and contacts abov
 @checked
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """Random postures of a hand, with fingertip centres [m] in their own frame (`tips_frame`), for quick comparison.
+    """Random postures of a hand, prepared for quick comparison of their fingertips with contact sets.
+
+    The fingertip centres [m] of each posture are given in a frame that they define themselves (`tips_frame`).
 
     >>> from torchgrasp import load_hand
     >>> library = PostureLibrary.of(load_hand("barrett"), count=200)
@@ -67,7 +69,7 @@ class PostureLibrary(Value):
 
     @classmethod
     def _drawn(cls, hand: Hand, count: int, seed: int) -> "PostureLibrary":
-        """Draw `count` random postures."""
+        """Draw `count` random postures; postures whose fingertips lie on a line are left out."""
         joints = sample_configurations(hand, count, seed).joints.to(hand.lower.device, torch.float64)
         joints = joints[~degenerate(triangle_of(hand.tip_centres(joints)))]
         centres, (_, pads) = hand.tip_centres(joints), hand.fingertips(joints)
@@ -77,7 +79,7 @@ class PostureLibrary(Value):
 
 
 def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return three of the points in finger order: the first, the centroid of the middle points, and the last."""
+    """Return a triangle for three to five points: the first point, the centroid of the middle points, and the last."""
     if points.shape[-2] == 3:
         return points
     between = points[..., 1:-1, :].mean(-2, keepdim=True)
@@ -105,14 +107,15 @@ def nearest_postures(
     n_seeds: Count = 8,
     reachable: Reachable | None = None,
 ) -> IKSeeds:
-    """Return the library postures nearest to contact sets as seeds, each placed on the contacts by Eq. (24).
+    """Return the library postures that fit contact sets best, as initial guesses (seeds) placed on the contacts.
 
-    Seeds are in the order of the contact sets, best first within a set. Degenerate contact sets have no seeds. `energy`
-    is half the squared distance of the features. If a pose is not `reachable`, the next posture takes its place.
+    Each contact set has at most `n_seeds` seeds, best first, or none if its contacts lie on a line. The seeds are in
+    the order of the contact sets; Eq. (24) gives their poses. `energy` is half the squared distance between the
+    features of posture and contacts. If the arm cannot reach a pose, the next posture takes its place.
 
     Raises:
-        BadArgument: `n_seeds`, for each contact set, is not in [1, 64], or above six times the number of postures;
-            contacts on another device than the library, or of another number than its fingertips.
+        BadArgument: `n_seeds` is not in [1, 64], or above six times the number of postures; contacts are on another
+            device than the library, or their number in a set is not that of the hand's fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -163,7 +166,7 @@ def nearest_postures(
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
 ) -> tuple[Float[Tensor, "r p 4 4"], Float[Tensor, "r p d"]]:
-    """Return the virtual frame and features of contacts for each assignment to fingers; arbitrary if not `framed`."""
+    """Return frame and features of r contact sets for each of p assignments to fingers; arbitrary if not `framed`."""
     stand_in = torch.eye(3, dtype=centres.dtype, device=centres.device)
     triangle = torch.where(framed[..., None, None], triangle_of(centres), stand_in)
     obj_from_vf = rigid(virtual_frame(triangle)[..., :3, :3], centres.mean(-2))
@@ -174,7 +177,7 @@ def _describe(
 def _energies(
     wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
 ) -> Float[Tensor, "r p s"]:
-    """Return half the squared distance between features of contacts and postures; infinite where not `framed`."""
+    """Return half the squared distance between the features of contacts and postures; infinite where not `framed`."""
     energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
     return torch.where(framed[..., None], energy, torch.inf)
 
@@ -182,7 +185,7 @@ def _energies(
 def _likely_assignments(
     wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
 ) -> Int[Tensor, "r a"]:
-    """Return the assignments of contacts to fingers whose features come closest to the first 500 postures."""
+    """Return the indices of the assignments of contacts to fingers with features nearest to one of 500 postures."""
     if wanted.shape[1] <= ASSIGNMENTS:
         return torch.arange(wanted.shape[1], device=wanted.device).expand(len(wanted), -1)
     nearest = _energies(wanted, given[:500], framed).amin(-1)
@@ -193,14 +196,16 @@ def _likely_assignments(
 def query_mixture(
     hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: Count = 8, max_energy: Positive = DEFAULT_ENERGY
 ) -> IKSeeds:
-    """Return seeds near the contacts from the learned model, for all six assignments (Eqs. 21-24).
+    """Return initial guesses (seeds) for sets of three contacts from the learned model, Eqs. (21)-(24) of the paper.
 
-    For every assignment within reach (Eq. 21: `max_energy`) the joints are the conditional mean (Eq. 23) and the means
-    of the most responsible components, `n_seeds` in all. Within a contact set, seeds on the right side of the surface
-    come first, then by tip error. An unreachable set has no seeds.
+    An assignment of contacts to fingers is reachable if its energy (Eq. 21) is below `max_energy`. Each reachable
+    assignment gives `n_seeds` seeds: the mean joints given the contacts (Eq. 23), and the mean joints of the most
+    responsible components. The seeds of a contact set that touch the surface from outside come first, then seeds of
+    small tip error. A contact set without a reachable assignment has no seeds.
 
     Raises:
-        BadArgument: a mixture of another hand, limits or fingertips, a number out of range, or malformed contacts.
+        BadArgument: the mixture is of another hand, or of other joint limits or fingertips; a number is out of range,
+            or contacts are malformed.
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
@@ -212,7 +217,7 @@ def query_mixture(
 
 
 def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, max_energy: float) -> IKSeeds:
-    """Return the seeds of a part of the contact sets."""
+    """Return the seeds of some of the contact sets, as `query_mixture` does for all."""
     code = encode((contacts.points.double(), contacts.normals.double()))
     energy = mixture.energy(code)
     row, assignment = torch.nonzero(energy < max_energy, as_tuple=True)  # NaN is not less

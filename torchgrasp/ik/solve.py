@@ -37,8 +37,9 @@ EXACT = 1e-6  # sum of squared residuals [mm2] at which a seed is done
 class IKSolution(Batch):
     """A hand configuration for each contact set; finger i touches contact `permutation[:, i]`.
 
-    `clearance` [m] is the least clearance of the links; `attempts` counts the refined seeds. A contact set without
-    seeds gives NaN.
+    `tip_error` [m] is each tip's distance from its contact, `normal_angle` [rad] the contact's angle from the pad's
+    axis, and `clearance` [m] the least clearance of the links. `attempts` counts the initial guesses (seeds) that were
+    refined. A contact set without seeds has NaN.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -71,15 +72,15 @@ def solve_ik(
 
     Args:
         contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not used.
-        mixture: the hand's learned model; without it only the library gives seeds.
-        world: what the links must not touch; by default only each other. All arguments are moved to the contacts'
-            device.
+        mixture: the hand's learned model; without it, only the library gives initial guesses.
+        world: object, table and obstacles that the links must not touch; by default, only self-collision counts. All
+            arguments are moved to the contacts' device.
         method: "cobyla" is the paper's method (Sec. 6.3): tips touch with their contact points, in any direction.
         library: the hand's random postures; by default they are drawn when they are needed.
 
     Returns:
-        The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of its contact and
-        inside its pad's cone, and every link is clear.
+        The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of its contact, every
+        contact direction is inside its pad's cone, and every link is clear.
 
     Raises:
         BadArgument: contacts that are not finite, or not one for each fingertip; a mixture of another hand, an unknown
@@ -126,7 +127,7 @@ def solve_ik(
 
 
 def _refine_seeds(hand: Hand, contacts: Contacts, world: CollisionWorld, method: Method, seeds: IKSeeds) -> IKSolution:
-    """Refine seeds and measure the resulting configurations."""
+    """Refine seeds onto their contacts by the given method, and measure the resulting configurations."""
     refined, rolling = refine_exactly, True
     if method == "cobyla":
         refined, rolling = refine_by_cobyla, False
@@ -142,7 +143,7 @@ def _refine_seeds(hand: Hand, contacts: Contacts, world: CollisionWorld, method:
 
 
 def refine_exactly(hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld) -> Configuration:
-    """Refine with a margin of clearance, then without margin; keep the second result where links stay clear."""
+    """Refine configurations with a margin of clearance, then without; keep the second result where links stay clear."""
     refined = refine(hand, start, contacts, world, EXACT)
     settled = refine(hand, refined, contacts, None, EXACT)
     return pick(measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined)
