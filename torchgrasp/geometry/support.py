@@ -58,10 +58,7 @@ class Support:
 def find_table(
     points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], table: Plane | float | None, up: object
 ) -> tuple[Support, ...]:
-    """Return the support on a given table, or without a table all supports found in the points, best first.
-
-    The camera at `viewpoint` [m] must be above them. `up` is a vector against gravity, or None if it is unknown.
-    """
+    """Return the support on a given table, or all supports found in the points, best first; the camera is above."""
     plane = as_plane(table)
     direction = None if up is None else torch.as_tensor(up).double().cpu()
     if plane is None:
@@ -198,8 +195,7 @@ class Hull:
 def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
     """Yield the connected groups of points in a plane, the largest first, down to a fiftieth of the largest.
 
-    Points in adjacent square cells of 3 cm are connected. Small gaps between cells are closed. Narrow strips of cells
-    are dropped: there, other surfaces cross the plane.
+    Points in adjacent cells of 3 cm are connected, also over small gaps. Narrow strips of cells are dropped.
     """
     from scipy.ndimage import binary_closing, binary_opening, label
 
