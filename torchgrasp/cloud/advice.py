@@ -164,7 +164,7 @@ def _judge_height(
 
 
 def _describe_support(plane: Plane, share: float, up: Float[Tensor, "3"]) -> Advice:
-    """Return the advice to cut off a table, the plane with this share of the cloud's points."""
+    """Return the advice to cut off a table, given the table's plane and its share of the cloud's points."""
     turn = f" --up {_triple(plane.normal, ' ')}, its normal," if float(plane.normal @ up) < 0.97 else ""
     found = f"a plane under the object, a table left in, with {share:.0%} of the points"
     return Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True)

@@ -27,7 +27,7 @@ def check_agreement(
 ) -> None:
     """Raise `BadArgument` if points lie off a mesh, or off a cloud and the space hidden behind the cloud.
 
-    Of the points, at most the given share may be farther than `slack` [m] from the `other` mesh or cloud.
+    At most the fraction `share` of the points may be farther than `slack` [m] from `other`, the mesh or the cloud.
 
     >>> from trimesh.creation import icosphere
     >>> check_agreement("mesh", torch.eye(3), "points", icosphere(), slack=0.02, share=0.2)
@@ -74,9 +74,10 @@ def _noise(cloud: PointCloud) -> float:
 
 
 def _distance_behind(points: Float[Tensor, "n 3"], cloud: PointCloud) -> Float[Tensor, "n"]:
-    """Return each point's distance [m] from a cloud and the space behind the cloud, as deep as the cloud is long.
+    """Return the distance [m] of each point from a cloud, including the space that the cloud hides behind it.
 
-    If the camera is unknown, the space within half of this length around the cloud counts as hidden.
+    The hidden space is as deep as the cloud is long. If the camera is unknown, the space within half of this length
+    around the cloud counts as hidden.
     """
     rows = draw_rows(len(cloud), 500)
     seen = cloud.points[rows].double().cpu()

@@ -129,7 +129,7 @@ def cast_mesh(
 def _in_image_box(
     mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"], x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]
 ) -> Bool[Tensor, "h w"]:
-    """Return a mask of the camera rays (x, y, 1) that pass through the image's box around the mesh."""
+    """Return a mask of the camera rays (x, y, 1) that pass through the bounding box of the mesh in the image."""
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
     if float(depth.min()) <= 1e-3:

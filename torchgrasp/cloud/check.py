@@ -79,7 +79,7 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
 def remove_outliers(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicate points and without outliers, such as flying pixels.
 
-    The mean distance of an outlier to its 8 nearest neighbours is more than 2.5 times the median of all points.
+    The mean distance of an outlier to its 8 nearest neighbours is above 2.5 times the median of this distance.
     Raises the errors of `check_cloud`.
 
     >>> points = torch.cat([0.1 * torch.rand(500, 3), torch.ones(1, 3)])
@@ -142,6 +142,6 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
 
 
 def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
-    """Return, for each of the groups 0, 1, ..., the first index at which `group` holds the group's number."""
+    """Return the first index of each of the numbers 0, 1, ... in `group`, which holds each point's group number."""
     order = torch.arange(len(group), device=group.device)
     return torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")[: int(group.max()) + 1]

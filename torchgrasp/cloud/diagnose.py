@@ -56,7 +56,7 @@ def diagnose_cloud(
 
     Args:
         cloud: points of one object [m].
-        up: vector of any length that points up; None for z, unless the cloud looks as if in its camera's frame.
+        up: vector of any length that points up; None for z, unless the cloud seems to be in its camera's frame.
         table: plane of the table; None if the table is assumed at the lowest point.
         stands: whether the object stands on a table; else the camera may be below it.
 

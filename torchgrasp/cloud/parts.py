@@ -110,7 +110,7 @@ def _find_support(cloud: PointCloud, up: Float[Tensor, "3"]) -> Support | None:
 
 
 def _select(cloud: PointCloud, keep: Bool[Tensor, "n"], what: str) -> PointCloud:
-    """Return the points in the mask `keep`; raise `TooFewPoints`, which calls the points `what`, for fewer than 4."""
+    """Return the cloud's points in the mask `keep`; raise `TooFewPoints` if there are fewer than 4 (named `what`)."""
     if int(keep.sum()) < MIN_POINTS:
         raise TooFewPoints("cloud", f"{int(keep.sum())} {what}", f"at least {MIN_POINTS} {what}")
     return cloud.select(keep)

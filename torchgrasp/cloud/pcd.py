@@ -53,7 +53,7 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
-    """Return the header of a PCD file, the words of each line by its first word, and the data after the header."""
+    """Return a PCD file's header, as a dict of each line's words by its first word, and the data after the header."""
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
@@ -68,7 +68,7 @@ def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
 
 
 def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
-    """Return decompressed data point by point; the compressed data hold each field for all points in turn."""
+    """Return decompressed data point by point; the file holds one field of all points, then the next field."""
     packed, unpacked = (int(n) for n in np.frombuffer(body, dtype="<u4", count=2))
     wanted = count * sum(kind.itemsize for kind in kinds)
     if unpacked != wanted or wanted > CLOUD_BYTES or packed > len(body) - 8:

@@ -25,7 +25,7 @@ MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """The consistency of a cloud's given normals with those of neighbouring points."""
+    """How well a cloud's given normals agree with the normals of neighbouring points."""
 
     flipped: Bool[Tensor, "n"]  # whether a normal opposes most of its neighbours' normals
     opposed: float  # share of opposite normals among pairs of neighbours
@@ -143,7 +143,7 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Float[Tensor, "3"] | None =
 
 
 def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> NormalCheck:
-    """Return how consistent the normals are among neighbouring points: flipped ones, and whether signs are trusted."""
+    """Return how well normals agree among neighbouring points: which are flipped, and whether signs can be trusted."""
     distance, index = nearest(points, 9)  # the point itself and eight neighbours: enough for a majority
     directions = unit(normals)
     cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)

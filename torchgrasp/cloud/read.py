@@ -60,7 +60,7 @@ def read_cloud(
       for several views, `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`, `.xyz`, `.txt`, `.csv` (text): an (n, 3) array, or (n, 6) with normals; colours are left out.
 
-    Images (h, w, 3) of points are accepted. Rows with NaN or infinity are left out, and rows of zeros if several.
+    Images (h, w, 3) of points are accepted. Rows with NaN or infinity are left out; so are zero rows, if several.
 
     Args:
         path: the file.
@@ -140,7 +140,7 @@ def cloud_from_array(
 
 @checked
 def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) -> Path:
-    """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically; `read_cloud_file` also reads the table.
+    """Write a cloud, and its table if given, as `.npz` (exact) or binary `.ply` (float32), in one atomic step.
 
     Raises:
         BadArgument: another suffix; several views for `.ply`, which has one viewpoint.
@@ -163,7 +163,7 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
 
 
 def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = None, scale: float = 1.0) -> CloudFile:
-    """Return the cloud, notes and table in named arrays, whose unit is `scale` [m]; rows not measured are left out."""
+    """Return a `CloudFile` made of named arrays in units of `scale` metres, without rows that were not measured."""
     notes: list[str] = []
     if "columns" in arrays:
         arrays = _split_columns(source, arrays, notes)

@@ -116,7 +116,7 @@ def add_noise(
 
 
 def _random_noise(depth: Tensor, normal: Tensor, sensor: SensorNoise) -> Tensor:
-    """Return depths [m] with random noise, the standard normal numbers scaled to the camera, and with depth steps."""
+    """Return depths [m] with a camera's random noise and depth steps, given a standard normal number for each."""
     if not sensor.base:
         return depth + sensor.sigma(depth) * normal
     disparity = sensor.base / depth + sensor.disparity * normal
@@ -172,7 +172,7 @@ def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoi
 
 @checked
 def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
-    """Return the median of each pixel in depth images of a camera and a scene that stand still.
+    """Return the median depth of each pixel over several depth images, in which camera and scene stand still.
 
     Pixels that most frames miss (0, NaN or infinity) are 0. The unit is that of the frames.
 

@@ -24,7 +24,7 @@ def guess_viewpoint(
 ) -> tuple[Float[Tensor, "3"], float]:
     """Return a camera position [m] that explains a view, and the angle [deg] within which the camera is likely.
 
-    The camera is placed 4 radii of the cloud away, in the direction above the support that explains the points best.
+    The camera is placed 4 radii of the cloud away, in the direction above the support that fits the points best.
     The origin is preferred if the view is in front of it and a camera can have been there. An angle of 180 degrees
     means that the points hardly tell the direction.
 
@@ -60,8 +60,8 @@ def guess_viewpoint(
 def can_see(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> bool:
     """Return whether a camera at a place [m] can have taken a view.
 
-    From there, points must not hide other points. Besides, the points are as dense as pixels, or hardly any other place
-    explains the points better, or a support is seen from above.
+    From there, points must not hide other points. Besides, the points must be as dense as the camera's pixels, or
+    hardly any other place may explain the points better, or the camera must look down on a support.
     """
     rows = draw_rows(len(points), DRAWN).to(points.device)
     points, normals = points[rows], normals[rows]
@@ -92,7 +92,7 @@ def _enclose(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Te
 def _explain(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoints: Float[Tensor, "k 3"]
 ) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
-    """Return two scores of each camera position, at most 1: how well it explains the bulge and the points' density.
+    """Return two scores of each camera position, at most 1, for how well it explains a view's bulge and point density.
 
     Visible surfaces bulge towards the camera. A pixel covers an area that grows with the squared distance, over the
     cosine between ray and normal.

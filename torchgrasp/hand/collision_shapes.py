@@ -97,7 +97,7 @@ def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float
 
 
 def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """Return the exact shapes of a URDF for self-collision of the `pairs` of links, by default all but neighbours."""
+    """Return the exact shapes of a URDF to test the `pairs` of links for collision, by default all but neighbours."""
     names = [x.name for x in urdf.links]
     tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
     if pairs is None:

@@ -132,7 +132,7 @@ class Fingertips(Value):
     carrier_from_tip: Float[Tensor, "3 4 f 1"]
 
     def __len__(self) -> int:
-        """Count the fingertips, f."""
+        """Return the number f of fingertips."""
         return len(self.names)
 
     @property

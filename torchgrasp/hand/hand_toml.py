@@ -1,4 +1,4 @@
-"""Reader of hand.toml, which tells a hand's fingers, pads, coupled and fixed joints, and links that can collide."""
+"""Reader of hand.toml, which describes a hand's fingers, pads, coupled and fixed joints, and colliding links."""
 
 import dataclasses
 import functools
@@ -118,7 +118,7 @@ def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
 
 
 def _entries(table: Field, required: Sequence[str], optional: Mapping[str, Any]) -> dict[str, Field]:
-    """Return the fields of a table, with defaults for optional keys; refuse unknown keys, as misspelt ones."""
+    """Return the fields of a table, with defaults for optional keys; refuse unknown keys, which may be misspelt."""
     fields = table.entries()
     for key in sorted(fields.keys() - {*required, *optional}):
         raise fields[key].wrong(f"one of {sorted([*required, *optional])}")

@@ -61,7 +61,7 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Float[Tensor, "3 4 l n"]:
-        """Return the upper three rows of every link's pose in the root's frame; the last axis counts the postures.
+        """Return every link's pose (3 x 4) in the root's frame, given the joint positions (j, n) of n postures.
 
         If `root` gives the poses of the root in another frame, the link poses are in that frame.
         """
@@ -103,7 +103,7 @@ class KinematicTree(Value):
 
 @dataclasses.dataclass(frozen=True)
 class FreeMotion(Value):
-    """Tables of how the links of a free-floating hand, and marker points on them, move; for refinement.
+    """Tables of how the links of a free-floating hand, and marker points fixed to the links, move in a small step.
 
     The q motions are three translations along the root's axes, three rotations about them, and the joints that the
     actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling` maps a step of pose (six numbers) and
@@ -209,7 +209,7 @@ def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
 
 
 def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
-    """Return a link's carrier, the last link up to it that a joint moves, and the link's pose in the carrier."""
+    """Return a link's carrier (the nearest link, itself or above, that a joint moves), and the link's pose in it."""
     above = {j.child: j for j in urdf.joints}
     pose = _tables(None)[0]
     while link in above and above[link].kind == "fixed":

@@ -48,7 +48,7 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def clearance(self, frames: Float[Tensor, "3 4 l n"], below: Bound = torch.inf) -> Float[Tensor, " n"]:
-        """Return the least signed separation [m] of all pairs: infinite if there are none, inexact above `below`."""
+        """Return each posture's least signed separation [m]: infinite if no pairs are tested, inexact above `below`."""
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
             return least

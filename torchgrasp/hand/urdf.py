@@ -90,7 +90,7 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A checked URDF: `data` holds the bytes of the file, `xml` those of the checked links and joints only."""
+    """A checked URDF: `data` holds the bytes of the file, `xml` a copy with only the checked links and joints."""
 
     path: Path
     name: str
@@ -127,7 +127,7 @@ class Urdf:
 
 @checked
 def read_urdf(path: Path | str) -> Urdf:
-    """Read and check a URDF file that the library can use.
+    """Read a URDF file, and check that the library can use it.
 
     Raises:
         HandFileError: see `read_published`; a mesh as a shape, a joint without limits, or a chain of couplings.
@@ -145,7 +145,7 @@ def read_urdf(path: Path | str) -> Urdf:
 
 
 def read_published(path: Path | str) -> Urdf:
-    """Read a URDF as published: meshes, joints without limits and chains of coupled joints are allowed.
+    """Read a URDF as its maker published it: meshes, joints without limits and chains of coupled joints are allowed.
 
     Raises:
         HandFileError: the file is missing, too large, hostile or not a tree of links.

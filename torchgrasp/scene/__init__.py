@@ -1,4 +1,4 @@
-"""What one camera saw of a table: objects, their support, free and hidden space."""
+"""Scenes: objects on a table as one camera saw them, with the free and the hidden space around them."""
 
 from torchgrasp.scene.file import read_scene, save_scene
 from torchgrasp.scene.occupancy import Occupancy, estimate_occupancy

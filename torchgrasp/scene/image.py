@@ -106,7 +106,7 @@ def image_of_cloud(
 ) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
     """Return the depth image that a pinhole camera at the viewpoint takes of a cloud, and each point's row and column.
 
-    The upright camera looks at the middle of the points. A pixel covers about two points, and has the nearer depth.
+    The upright camera looks at the middle of the points. A pixel covers about two points and keeps the nearest.
     """
     forward = unit(unit(points - viewpoint).mean(0))
     down = -up + (up @ forward) * forward

@@ -99,7 +99,7 @@ def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
     """Return the boolean mask of one object, given in any form that `read_labels` takes.
 
     Raises:
-        BadArgument: as `read_labels`; no pixel inside; several objects.
+        BadArgument: see `read_labels`; no pixel inside; several objects.
     """
     labels = read_labels(mask, shape, "mask")
     found = labels[labels > 0].unique()
@@ -146,7 +146,7 @@ def _run_lengths(text: bytes) -> list[int]:
 def label_image(
     image: DepthImage, support: Support, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
-    """Return the label of each pixel, from the given labels, the given mask, or else from `segment`; and notes.
+    """Return each pixel's label and notes; labels come from given labels, a given mask, or else from segmentation.
 
     Given labels lose pixels on the table and flying pixels. A mask becomes label 1, and loses strips of neighbouring
     objects, too. Pixels of the mask's object just outside of the mask get label 0. A note tells of each mask that loses
@@ -219,7 +219,7 @@ def label_again(
 
 
 def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> Int[Tensor, "h w"]:
-    """Return the labels of the other objects; the target, and strips of its own object around its mask, become 0."""
+    """Return the labels of objects beside a target; the target, and strips of its object around its mask, become 0."""
     from scipy.ndimage import binary_dilation
 
     about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels

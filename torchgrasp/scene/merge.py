@@ -1,4 +1,4 @@
-"""Merging of the pieces of a depth image that belong to one object.
+"""Merging of pieces, which are connected smooth surfaces in a depth image, that belong to one object.
 
 Two pieces belong to one object if they meet at two ends, as a handle and its cup do; if one is over the footprint of
 the other; if they form the rim of a hollow body; or if one floats beside the other. Touching pieces also belong to one
@@ -68,7 +68,7 @@ def find_touching(image: DepthImage, labels: Int[Tensor, "h w"]) -> list[tuple[i
 
 
 def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> list["_Body"]:
-    """Return bodies, those of one object joined, given the gaps [m] between pieces and which pieces float."""
+    """Join bodies (groups of pieces) to whole objects, given the gaps [m] between pieces and which pieces float."""
 
     def between(a: _Body, b: _Body) -> float:
         return float(gap[np.ix_(a.rows, b.rows)].min())

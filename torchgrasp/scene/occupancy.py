@@ -165,7 +165,7 @@ def load_model() -> dict[str, Any]:
 
 
 def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
-    """Return the probability that places of a kind are full; log-odds add a piecewise linear function per feature."""
+    """Return the probability that places of a kind are full; log-odds sum a piecewise linear function of each."""
     model, odds = load_model()[kind], torch.full_like(features[:, 0], load_model()[kind]["bias"])
     for x, knots, values in zip(features.unbind(-1), model["knots"], model["values"], strict=True):
         odds += torch.from_numpy(np.interp(x.numpy(), knots, values)).to(odds)
@@ -176,8 +176,8 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     """Return the probability that each voxel around the target is full of something other than target and table.
 
-    The scene must be in its upright frame. Space in front of a measured depth is free. Behind an object, a model
-    estimates the probability. Little is known behind the target and outside the image. The computation is on the CPU.
+    The scene must be in its upright frame, with z up. Space in front of a measured depth is free. Behind an object, a
+    model estimates the probability. Little is known behind the target and outside the image. It runs on the CPU.
 
     Raises:
         BadArgument: a target without points.

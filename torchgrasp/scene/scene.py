@@ -80,7 +80,7 @@ class Scene(Value):
             depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in millimetres.
             intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth` takes.
             camera_pose: obj_from_camera (4, 4), rigid; without it results are in the camera's frame.
-            mask: (h, w), not 0 at the target, with an outline within a few pixels; or in another form of `labels`.
+            mask: (h, w), not 0 at the target, accurate to a few pixels; or in another form that `labels` allows.
             labels: (h, w) of whole numbers, where 0 means no object; a picture with a colour for each object; a list of
                 masks; or COCO's run lengths.
             point: a place on the target, as a pixel (u, v) or a point (x, y, z) [m].
@@ -91,7 +91,7 @@ class Scene(Value):
         Raises:
             BadArgument: what `cloud_from_depth` refuses; mask or labels of another size; a target that is the table; a
                 point where nothing was measured; a camera below the table; a pose or a unit that the view contradicts.
-            NoSupport: no plane that objects stand on.
+            NoSupport: no plane is found on which objects stand.
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")
@@ -134,7 +134,7 @@ class Scene(Value):
 
         Raises:
             BadArgument: no viewpoint, or several; labels or mask of another size; and as `from_depth`.
-            NoSupport: no plane that objects stand on.
+            NoSupport: no plane is found on which objects stand.
 
         >>> from torchgrasp import PointCloud, load_scene
         >>> seen = load_scene()
