@@ -1,8 +1,8 @@
-"""Certificates of frictional form closure, Eq. (13): for each contact set a verdict, with a proof.
+"""Certificates of frictional form closure, Eq. (13) of the paper: for each contact set a verdict, with a proof.
 
-Coefficients phi that balance all wrenches prove closure, and bound the margin from below. A witness, which is a wrench
-that no contact opposes, disproves closure, and bounds the margin from above. A batched simplex method (`closure`)
-finds both. HiGHS decides where the two bounds leave the verdict open.
+Positive coefficients phi that balance all contact wrenches prove closure, and bound its margin from below. A witness,
+which is a wrench that no contact opposes, disproves closure, and bounds the margin from above. A batched simplex method
+(module `closure`) finds both. The solver HiGHS decides where the two bounds leave the verdict open.
 """
 
 import numpy as np
@@ -29,15 +29,15 @@ UNIT_TOLERANCE = 1e-3  # largest difference of a given normal's length from 1: w
 @checked
 @single_threaded
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
-    """Prove in float64 whether contact sets have frictional form closure, Eq. (13).
+    """Prove in float64 whether contact sets have frictional form closure, Eq. (13) of the paper.
 
-    The margin is max s: W phi = 0, sum phi = 1, phi >= s; -inf if no phi balances. The friction cones have `spec.edges`
-    edges at friction `spec.planned_friction`. A `closed` set, one with force closure, has a margin of at least 1e-6 and
-    wrenches of full rank.
+    The margin is the largest s for which coefficients phi >= s with sum phi = 1 balance the wrenches W of all cone
+    edges, W phi = 0; it is -inf if no phi balances them. The friction cones have `spec.edges` edges at friction
+    `spec.planned_friction`. A set is `closed` if its margin is at least 1e-6 and its wrenches have full rank.
 
-    The `witness` v of another set is a wrench that no contact force opposes: v.w >= 0 for every edge wrench w, up to
-    rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only the rank is too low, the wrenches are smallest
-    along v. Contacts that are not finite are not closed and give NaN.
+    If a set is not closed, its `witness` v is a wrench that no contact force opposes: v.w >= 0 for every edge wrench w,
+    up to rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only the rank is too low, the wrenches are
+    smallest along v. Sets with contacts that are not finite are not closed, and their margin and witness are NaN.
 
     Args:
         contacts: sets of three to five contacts with outward unit normals, from any planner.
@@ -73,7 +73,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
 
 def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
-    """Return margin, residual and witness of each wrench matrix, by our simplex method, or by HiGHS where it fails."""
+    """Return margin, residual max |W phi| and witness of m wrenches, by the simplex method, or by HiGHS if it fails."""
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
     margin, upper = phi.amin(-1), bound_margin(wrench, witness)
@@ -87,7 +87,7 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Te
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
-    """Return the upper bound of the margin that a witness proves; NaN for a witness that proves nothing."""
+    """Return the upper bound of the closure margin that each witness proves; NaN if the witness proves nothing."""
     # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g / sum(g - min g).
     product = (wrench @ witness[..., None])[..., 0]
     least = product.amin(-1)
@@ -95,7 +95,7 @@ def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) 
 
 
 def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]:
-    """Return margin, residual max |W phi| and witness for one matrix of m wrenches, by HiGHS."""
+    """Return closure margin, residual max |W phi| and witness (None if unknown) of one set of m wrenches, by HiGHS."""
     from scipy.optimize import linprog
 
     m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
@@ -119,7 +119,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
 
 
 def check_unit(normals: Vectors) -> Vectors:
-    """Return the normals; raise `BadArgument` if their length is not 1. NaN passes."""
+    """Return the normals; raise `BadArgument` if the length of a normal is not 1. Normals with NaN are accepted."""
     length = torch.linalg.vector_norm(normals, dim=-1)
     wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
     if len(wrong):
@@ -130,7 +130,7 @@ def check_unit(normals: Vectors) -> Vectors:
 
 
 def check_contacts(contacts: Contacts) -> Contacts:
-    """Return the contacts; raise `BadArgument` for wrong shapes, or for other than 3 to 5 contacts in a set."""
+    """Return the contacts; raise `BadArgument` if shapes are wrong, or if a set has not 3 to 5 contacts."""
     points = contacts.points
     for name, value in (("points", points), ("normals", contacts.normals)):
         if value.shape != (*points.shape[:2], 3) or not value.is_floating_point():

@@ -1,17 +1,19 @@
-"""Frictional form closure, Eq. (13): the greatest margin of a balance, and exact closure with round cones.
+"""Frictional form closure, Eq. (13) of the paper: its margin with linearised cones, and exact tests with round cones.
 
-**The margin.** Over m wrenches a_k with mean a, the programme is max s: W phi = 0, sum phi = 1, phi >= s. With
-c_k = m (a - a_k) its dual is max a.v: c_k.v <= 1, in six unknowns, and s = 1/m - a.v. The point v = 0 is feasible, so
-the simplex method needs no first phase. At the optimum a = sum lambda_k c_k with lambda >= 0 on six tight rows. Then
+**The margin.** W holds the m contact wrenches a_k, and a is their mean. The linear programme is: maximise s with
+W phi = 0, sum phi = 1, phi >= s. With c_k = m (a - a_k) its dual is: maximise a.v with c_k.v <= 1, in six unknowns v;
+then s = 1/m - a.v. The point v = 0 is feasible, so the simplex method needs no first phase. At the optimum six
+constraints are tight, and a = sum lambda_k c_k over these six with lambda >= 0. Then
 
     phi_k = s + m lambda_k  balances with margin s;      w = v has  w . a_k >= -s  for all k.
 
-phi proves that the margin is at least s, and w that it is at most s. If s <= 0, no contact can push against w.
+phi proves that the margin is at least s, and the witness w proves that it is at most s. If s <= 0, no contact can push
+against w.
 
-**Round cones.** Three balanced forces are coplanar, and a test in their plane decides. More contacts are decided by
-proofs. A positive balance of some cone edges proves closure. A wrench that no force of a round cone opposes proves that
-the contacts are open. A programme over some edges finds a balance, or a wrench that no edge opposes. In the second case
-the forces that oppose the wrench most become further edges.
+**Round cones.** Three balanced forces are coplanar, so a test in the plane of three contacts decides. Four or five
+contacts are decided by proofs. A positive balance of some cone edges proves closure. A wrench that no force of a round
+cone opposes disproves closure. A linear programme over some edges finds a balance, or a wrench that no edge opposes. In
+the second case the forces that oppose the wrench most become further edges.
 """
 
 import math
@@ -47,10 +49,11 @@ def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Te
 
 
 def tangents(points: Vectors, normals: Vectors) -> Vectors:
-    """Return a unit tangent at each contact that rotates with the object: the first edge of its friction cone.
+    """Return a unit tangent at each contact, along which the first edge of its friction cone leans.
 
-    It lies in the plane of three contacts: of four or five, those whose plane is the most perpendicular to the tangent
-    plane, weighted by area. It is arbitrary where no plane gives a tangent and friction cannot give closure.
+    The tangent rotates with the object. It lies in the plane of three contacts; of four or five contacts, the three are
+    taken whose plane is the most perpendicular to the tangent plane, weighted by area. The tangent is arbitrary where
+    no plane gives one and friction cannot give closure.
     """
     first, second, third = subsets(points.shape[1], 3, points.device).unbind(1)
     plane = torch.linalg.cross(points[:, second] - points[:, first], points[:, third] - points[:, first])  # (b, k, 3)
@@ -86,7 +89,10 @@ def cone_edges(
 
 
 def wrenches(points: Vectors, normals: Vectors, friction: float, edges: int = 8) -> Float[Tensor, "b f e 6"]:
-    """Return the primitive contact wrenches w of Eq. (13), force then torque, of the edges of all friction cones."""
+    """Return the wrench (force, then torque) of each edge of all linearised friction cones: w in Eq. (13) of the paper.
+
+    The torque is about the contacts' centroid, and lengths are divided by the contacts' root-mean-square radius.
+    """
     force = cone_edges(normals, tangents(points, normals), friction, edges)
     centre, radius = centre_and_radius(points)
     arm = ((points - centre) / radius)[:, :, None].expand_as(force)
@@ -100,16 +106,17 @@ def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
 
 
 def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
-    """Return the coefficients phi of the greatest margin of each grasp, and the unit witness of that margin.
+    """Return for each grasp the coefficients phi that balance its m wrenches with the greatest margin, and a witness.
 
-    The witness is a wrench that proves that no margin is greater. If no coefficients balance the wrenches, it proves
-    that instead, and phi has no meaning. Rounding or too few pivots may spoil both: check them.
+    The margin is the smallest coefficient. The witness, a unit wrench, proves that no margin is greater. If no
+    coefficients balance the wrenches, the witness proves that instead, and phi has no meaning. Rounding or too few
+    pivots may spoil both: check them.
     """
     return in_chunks(_solve, wrench, GRASPS_PER_CHUNK)  # pyright: ignore[reportReturnType]
 
 
 def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
-    """Run the simplex method for all grasps at once, until the last one is at its optimum."""
+    """Return the result of `solve_closure_lp`: run the simplex method for all grasps at once, until all are optimal."""
     b, m, _ = wrench.shape
     row = torch.arange(b, device=wrench.device)
     mean = wrench.mean(1)
@@ -163,9 +170,9 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
 
 
 def closed_exact(points: Vectors, normals: Vectors, friction: float, guess: Guess = None) -> Bool[Tensor, "b"]:
-    """Return which contact sets have frictional form closure with round cones; borderline sets have not.
+    """Return a mask of the contact sets with frictional form closure under round cones; borderline sets are not closed.
 
-    `guess` holds coefficients phi from `first_balance` for similar contacts, to save time.
+    `guess` holds wrench coefficients from `first_balance` for similar contacts, which save time.
     """
     if points.shape[1] == 3:
         return _closed_in_plane(points, normals, friction) & ~degenerate(points)
@@ -173,15 +180,15 @@ def closed_exact(points: Vectors, normals: Vectors, friction: float, guess: Gues
 
 
 def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[Tensor, "b m"]:
-    """Return coefficients phi of the greatest margin for cones with few edges; arbitrary if none balance."""
+    """Return the coefficients of greatest margin that balance cones with few edges; arbitrary if none balance them."""
     return solve_closure_lp(wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2))[0]
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
     """Return which sets of three contacts have force closure: balanced forces lie in the plane of the contacts.
 
-    Each cone cuts an angle from the plane. The six planar wrenches along the sides of these angles must positively span
-    the planar wrenches: no plane through two of them has the others on one side.
+    Each friction cone cuts an angle from the plane. The six planar wrenches along the sides of these angles must
+    positively span all planar wrenches: no plane through two of the wrenches has the others on one side.
     """
     centre, radius = centre_and_radius(points)
     arm = (points - centre) / radius
@@ -237,7 +244,7 @@ def _balances(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Bool
 
 
 def _corrected(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Float[Tensor, "b m"]:
-    """Return the balancing coefficients with the smallest relative change from given ones; they may be negative."""
+    """Return coefficients that balance the wrenches, as near as possible to `phi`; they may be negative."""
     weighted = phi.square()[..., None] * wrench
     factor, _ = torch.linalg.cholesky_ex(wrench.mT @ weighted)
     dual = torch.cholesky_solve((phi[:, None] @ wrench).mT, factor)

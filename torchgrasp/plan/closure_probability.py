@@ -29,7 +29,7 @@ from torchgrasp.values import Contacts
 FOOTPRINT = 0.012  # half the width [m] over which a fingertip senses the slope of the surface: the radius of its sphere
 NODES = (4.0, 1.5, 0.0, -1.5, -4.0)  # nodes of a line, in standard deviations of the surface at its contact
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
-"""Outer half of the grid, in the same unit; it holds all nodes."""
+"""Outer half of the grid on a line, in standard deviations of the surface; all nodes are grid points."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +37,12 @@ class LinePosterior(Batch):
     """The joint Gaussian of signed distance d and its gradient w along the lines x + t n through the contacts.
 
     Args:
-        points: planned contacts x, normalised.
+        points: planned contacts x, in normalised units.
         normals: outward unit normals n.
-        deviation: standard deviation of the surface at the contact; nodes and grid are multiples of it.
-        distance: mean of d at the grid points, from outside to inside.
-        slope: mean of w at the nodes.
-        root: symmetric root of the covariance of the z = 20 f values (d, w) at the nodes, line by line, node by node.
+        deviation: standard deviation of the surface at each contact; t of nodes and grid points is a multiple of it.
+        distance: mean of d at the 23 grid points of each line, from outside to inside.
+        slope: mean of w at the five nodes of each line.
+        root: symmetric root of the covariance of the z = 20 f values (d, w) at all nodes, line by line, node by node.
     """
 
     points: Vectors
@@ -60,7 +60,7 @@ def grid() -> Float[Tensor, "23"]:
 
 
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
-    """Return the weights that interpolate linearly between nodes in descending order; constant outside."""
+    """Return the weights of k nodes (in descending order) that interpolate linearly at positions `at`."""
     held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
     gaps = nodes[:-1] - nodes[1:]
     share = ((nodes[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
@@ -68,13 +68,13 @@ def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[T
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
-    """Return which contact sets lie inside the domain, at least a fingertip's footprint from its edge."""
+    """Return a mask of the contact sets inside the shape's domain, at least half a fingertip's width from its edge."""
     radius = torch.linalg.vector_norm(shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1)
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
-    """Return the posterior of the surface along the normals of all contacts; raises as `closure_probability`."""
+    """Return the posterior of the surface on the normal line of each contact; raises as `closure_probability`."""
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
         check_tensor(f"contacts.{name}", value, (len(contacts), f, 3))
@@ -97,7 +97,7 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
 
 
 def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
-    """Return which covariance entries belong to two contacts on the same wall, given which contacts are on it."""
+    """Return a mask of the covariance entries of two contacts on one wall of a vessel; `own` marks its contacts."""
     own = own.repeat_interleave(4 * len(NODES), 1)
     return own[:, :, None] & own[:, None]
 
@@ -105,7 +105,7 @@ def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
 def _along_lines(
     shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]]:
-    """Return standard deviation, mean distance on the grid, mean gradient and covariance at the nodes, for one wall."""
+    """Return for one wall: deviation at contacts, mean distance on the grid, mean gradient and covariance at nodes."""
     jet = shape.jet(points.flatten(0, 1))
     deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
@@ -122,7 +122,10 @@ def _along_lines(
 def node_covariance(
     shape: ShapeGP, points: Vectors, normals: Vectors, nodes: Float[Tensor, "b f 5"]
 ) -> Float[Tensor, "b z z"]:
-    """Return the posterior covariance of (d, w) at all nodes, or at the domain's edge; w is a difference quotient."""
+    """Return the posterior covariance of signed distance d and gradient w at all nodes of the lines.
+
+    Nodes outside the domain are moved to its edge. The gradient is a difference quotient over a fingertip's width.
+    """
     width = FOOTPRINT / shape.scale
     along = (points * normals).sum(-1)
     half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
@@ -142,7 +145,10 @@ Touches = Float[Tensor, "b n f 3"]
 
 
 def first_contact(lines: LinePosterior, drawn: Float[Tensor, "b n z"]) -> tuple[Touches, Touches]:
-    """Return where fingertips touch n drawn surfaces, and the normals there; NaN where a line meets no surface."""
+    """Return points and normals at which fingertips touch n random surfaces; NaN where a line meets no surface.
+
+    `drawn` holds the deviations of the random surfaces from the mean, at the nodes of the lines.
+    """
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
     t, nodes = grid().to(drawn), torch.tensor(NODES).to(drawn)
     distance = lines.distance[:, None] + deviation[..., 0] @ interpolation(t, nodes).T
@@ -180,17 +186,17 @@ def closure_probability(
     n: Annotated[int, Range(1, 10**8)] = 2500,
     seed: Seed = 0,
 ) -> ClosureProbability:
-    """Return the probability of force closure on the uncertain surface, by Monte Carlo.
+    """Return the probability that each contact set has force closure on the uncertain surface, by Monte Carlo.
 
-    All contact sets share the random draws, and no result depends on another set.
+    All contact sets share the random surfaces, and no result depends on another set.
 
     Args:
         shape: the uncertain shape.
         contacts: sets of 3 to 5 contacts [m] with outward unit normals, inside the domain of the shape. A draw in which
             a finger meets no surface within 12 standard deviations counts as one without force closure.
-        spec: gives the friction of execution, `friction`; `planned_friction` is not used.
-        n: number of draws. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is that of (k + 1) / (n +
-            2) for k draws with force closure, and so never 0.
+        spec: its `friction` is used, the friction coefficient at execution; `planned_friction` is not used.
+        n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is computed for
+            the fraction (k + 1) / (n + 2) if k draws have force closure, and so never 0.
         seed: random seed.
 
     Raises:
@@ -209,7 +215,7 @@ def closure_probability(
 
 
 def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the fraction of n drawn surfaces on which each contact set has force closure; 0 at the domain's edge."""
+    """Return the fraction of n random surfaces on which each contact set has force closure; 0 at the domain's edge."""
     inside = well_inside(shape, contacts)
     share = contacts.points.new_zeros(len(contacts))
     share[inside] = closed_share(line_posterior(shape, contacts[inside]), friction, n, seed).to(share)
@@ -217,7 +223,7 @@ def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
 
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the fraction of n drawn surfaces on which each contact set has force closure."""
+    """Return the fraction of n random surfaces, drawn on `lines`, on which each contact set has force closure."""
     draws_per_chunk = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
     gpu_draws = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
     generator = torch.Generator().manual_seed(seed)

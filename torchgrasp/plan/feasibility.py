@@ -33,16 +33,16 @@ INSIDE = 0.95  # share of the largest variation that guiding points allow: the j
 
 
 def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
-    """Return n unit tangents around each contact, equally spaced."""
+    """Return n unit tangents at each contact, at equal angles around its normal."""
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
 def normal_variation(
     shape: Shape, points: Vectors, normals: Vectors, radius: float, among: Bool[Tensor, "b f"] | None = None
 ) -> Float[Tensor, "b f"]:
-    """Return the largest angle [rad] between a contact's normal and those on a ring of `radius` [m] on its wall.
+    """Return for each contact the largest angle [rad] between its normal and the normals on a ring around it.
 
-    Contacts outside the mask `among` have infinite angles.
+    The ring has the given `radius` [m]. Contacts outside the mask `among` have infinite angles.
     """
     variation = torch.full_like(points[..., 0], math.inf)
     among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
@@ -54,7 +54,7 @@ def normal_variation(
 
 
 def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
-    """Return the largest angle [rad] between each contact's normal and the normals at its ring, on one surface."""
+    """Return the largest angle [rad] between each contact's normal and the surface normals at its `ring` points."""
     _, gradient = shape.mean_and_gradient(project(shape, ring, steps=1).flatten(0, 1))
     there = unit(gradient).view_as(ring)
     here = normals[:, None].expand_as(there)
@@ -64,9 +64,10 @@ def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[T
 
 @dataclasses.dataclass(frozen=True)
 class FlatnessConstraint(Batch):
-    """Constraint values that are <= 0 where the surface is flat, linear in the 3 f coordinates about the points `at`.
+    """A linear model, near the contact points `at`, of k constraint values that are <= 0 where the surface is flat.
 
-    The surface normals on the ring cost as much as several steps of a solver: evaluate the constraint rarely.
+    `by_points` holds their derivatives by the 3 f coordinates of a contact set. To make this model costs as much as
+    several solver steps: make it rarely.
     """
 
     value: Float[Tensor, "b k"]
@@ -74,14 +75,15 @@ class FlatnessConstraint(Batch):
     at: Vectors
 
     def values(self, points: Vectors) -> Float[Tensor, "b k"]:
-        """Return the values at nearby points, by the linear model."""
+        """Return the constraint values at nearby points, by the linear model."""
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
 def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
-    """Return |n - n_k| for the normals n at a contact and n_k on its ring, less the chord of `flatness` [rad].
+    """Return by how much the normals around each contact differ from its normal beyond the angle `flatness` [rad].
 
-    The values are lengths, chords times the ring's radius in normalised units; `radius` is in m.
+    A value is |n - n_k|, for the normals n at a contact and n_k on a ring of `radius` [m] around it, less the chord of
+    `flatness`. It is multiplied by the ring's radius in normalised units, and so is a length.
     """
     (first, _), *others = walls_at(shape, points)
     found = _wall_constraint(first, points, flatness, radius)
@@ -117,7 +119,7 @@ ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far 
 
 
 def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> ContactPlan:
-    """Return the plan of contacts at normalised `points`, with the first constraint that each contact set violates."""
+    """Check contact sets at normalised `points`; return them as a plan, with each set's first violated constraint."""
     jet = triple_jet(shape, points)
     normals, metres = jet.normals, shape.metres(points)
     wrench = wrenches(points, normals, spec.planned_friction, spec.edges)

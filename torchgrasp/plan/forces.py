@@ -1,14 +1,14 @@
 """Balanced forces of three to five contacts that need the least friction.
 
-Forces that balance lie in the null space of the grasp map. For three contacts the space has three dimensions, which a
-push along each side of the triangle spans, and a search over directions finds the best forces. For four and five
-contacts the forces are F = N z, with normal parts a_i and tangential parts t_i. The friction cones of a tangent tau
-have an analytic centre, the minimum of
+Forces that balance lie in the null space of the grasp map. For three contacts the null space has three dimensions:
+opposite pushes along each side of the triangle. A search over directions in this space finds the best forces. For four
+and five contacts the forces are F = N z, with a basis N of the null space, normal parts a_i and tangential parts t_i.
+Friction cones with friction coefficient tau have an analytic centre, the forces that minimise
 
     sum c_i a_i - sum log(tau^2 a_i^2 - |t_i|^2).
 
-Newton steps follow the centre while tau falls towards the ratio that the forces need [1]. The c_i = 2 / (preferred
-normal force) also fix the scale.
+Newton steps follow the centre while tau falls towards the least friction coefficient that balanced forces need [1]. The
+factors c_i = 2 / (preferred normal force) also fix the scale.
 
 [1] Boyd and El Ghaoui, Linear Algebra and its Applications 188, 1993.
 """
@@ -41,16 +41,16 @@ Slide = Float[Tensor, "b f 3 k"]
 
 
 def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
-    """Return the grasp map: from the 3 f components of forces at `points` to force and torque about their centroid."""
+    """Return the matrix from 3 f force components at `points` to total force and torque about the points' centroid."""
     arms = points - points.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
     return torch.cat([torch.cat([eye] * arms.shape[-2], -1), torch.cat(skew(arms).unbind(-3), -1)], -2)
 
 
 def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"]:
-    """Return unit internal forces of all p `contact_pairs`: `[..., k, i, :]` acts on contact i in pair k.
+    """Return the opposite unit forces between the contacts of each pair; `[..., k, i, :]` acts on contact i in pair k.
 
-    They span the null space of the grasp map, except for four or five contacts in one plane.
+    The forces of all pairs span all balanced forces, except for four or five contacts in one plane.
     """
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)
@@ -110,7 +110,7 @@ def least_friction_forces(
 def _search_forces(
     points: Float[Tensor, "b 3 3"], normals: Float[Tensor, "b 3 3"], preferred: Float[Tensor, "b 3"] | None
 ) -> Float[Tensor, "b 3 3"]:
-    """Return the balanced forces of three contacts, of any scale; NaN where none push at all contacts."""
+    """Return balanced forces of three contacts that need least friction, of any scale; NaN if none push everywhere."""
     sides = points[:, [1, 2, 0]] - points
     sides = sides / ((sides * sides).sum(-1) ** 0.5)[..., None]
     basis = pull_signs(3, points.device).T[..., None] * sides[:, :, None]
@@ -199,18 +199,18 @@ def _pushing_forces(points: Vectors, normals: Vectors) -> Vectors:
 
 
 def _null_space(points: Vectors) -> Float[Tensor, "b f 3 k"]:
-    """Return an orthonormal basis (k = 3 f - 6) of the forces that balance."""
+    """Return an orthonormal basis of the balanced forces; its k = 3 f - 6 vectors are along the last axis."""
     wrench = grasp_map(points / centre_and_radius(points)[1])
     return torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:].unflatten(1, points.shape[1:])
 
 
 def _size(push: Push, slide: Slide, z: Float[Tensor, "b l k"]) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:
-    """Return the sizes of normal and tangential forces for l coordinate vectors z."""
+    """Return the sizes of normal and tangential forces at all contacts, for l vectors z of null-space coordinates."""
     tangential = (slide.flatten(1, 2) @ z.mT).unflatten(1, slide.shape[1:3])  # (b, f, 3, l)
     return z @ push.mT, torch.linalg.vector_norm(tangential, dim=2).mT
 
 
 def _needed(push: Push, slide: Slide, z: Float[Tensor, "b k"]) -> Float[Tensor, "b"]:
-    """Return the largest ratio of tangential to normal force over the contacts: the friction needed."""
+    """Return the friction coefficient that forces with null-space coordinates z need: the largest over the contacts."""
     normal, tangential = _size(push, slide, z[:, None])
     return (tangential / normal)[:, 0].amax(1)

@@ -1,10 +1,10 @@
-"""The contact planning problem, Eqs. (10)-(14), for a batch of contacts.
+"""The contact planning problem, Eqs. (10)-(14) of the paper, for a batch of contact sets.
 
 Unknowns x of a contact set are its f normalised points (f, 3) and a tension for each of the p pairs of points. Eq. (11)
 defines the normals. Eq. (13) asks for balanced forces in the friction cones. Three forces balance if and only if each
-is the sum of the pulls along the two sides at its contact [1]. Pulls between all pairs balance at more contacts, too,
-and give every balance unless the contacts lie in one plane. So W phi = 0 holds whatever the tensions; one inequality
-for each cone is left. Every inequality is a bound <= 0.
+force is the sum of the pulls along the two sides at its contact [1]. At four or five contacts, pulls between all pairs
+balance too, and give every balance unless the contacts lie in one plane. So W phi = 0 in Eq. (13) holds for all
+tensions, and one inequality for each friction cone is left. Every inequality has the form: value <= 0.
 
 [1] Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991.
 """
@@ -32,6 +32,9 @@ LEAST_SIDE = 0.05  # least distance of two tip centres, normalised: wrenches of 
 @runtime_checkable
 class Shape(Protocol):
     """The interface of a shape with uncertainty: a `ShapeGP`, or another implicit surface.
+
+    `scale` [m] is the length of one normalised unit, `domain_radius` (normalised) the radius in which the shape is
+    known, and `std_factor` multiplies standard deviations. `jet` gives signed distance, variance and derivatives.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> shape = fit_shape(load_object("jug").view)
@@ -74,12 +77,12 @@ def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tens
 
 
 def triple_jet(shape: Shape, points: Vectors) -> SurfaceJet:
-    """Return mean, variance and derivatives of the shape at all contacts."""
+    """Return mean and variance of the signed distance, with their derivatives, at all contacts."""
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))
 
 
 def triple_mean_jet(shape: Shape, points: Vectors) -> MeanJet:
-    """Return the mean signed distance and its derivatives at all contacts, without the variance where possible."""
+    """Return the mean signed distance and its derivatives at all contacts; the variance is not computed if possible."""
     jet = getattr(shape, "mean_jet", shape.jet)(points.flatten(0, 1))
     return MeanJet(*(x.unflatten(0, points.shape[:2]) for x in (jet.distance, jet.gradient, jet.hessian)))
 
@@ -93,24 +96,25 @@ def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
 
 @functools.cache
 def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
-    """Return 1 where a contact is the first of a pair, -1 where it is the second, else 0."""
+    """Return for contact i and pair k: 1 if the contact is the first of the pair, -1 if it is the second, else 0."""
     pairs = contact_pairs(fingertips, device)
     at = torch.arange(fingertips, device=device)[:, None]
     return (at == pairs[0]).double() - (at == pairs[1]).double()
 
 
 def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Float[Tensor, "b p"]]:
-    """Return the f points (f, 3) and the tensions of the pairs out of a vector of u unknowns."""
+    """Split each vector of u unknowns into f contact points (f, 3) and the tensions of all p pairs of contacts."""
     fingertips = (math.isqrt(25 + 8 * x.shape[1]) - 5) // 2
     return x[:, : 3 * fingertips].unflatten(1, (fingertips, 3)), x[:, 3 * fingertips :]
 
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values of all constraints, and their Jacobians by the u unknowns: coordinates, then tensions.
+    """Values of all constraints, and their Jacobians by the u unknowns: point coordinates, then tensions.
 
-    `centre` is the centroid of the f contacts, and `surface` their signed distances from the surface. `bounds` holds f
-    friction cones, f variances, f domain limits, p distances between contacts and, with a table, f heights.
+    `centre` is the centroid of the f contacts, and `surface` their signed distances from the surface; both should be 0.
+    `bounds` should be <= 0. It holds f friction cones, f variances, f domain limits, p distances between fingertips
+    and, with a table, f heights.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -132,7 +136,7 @@ class Constraints(Batch):
 
 
 def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
-    """Return the forces at the contacts and the vector from first to second of each pair; force: tension x vector."""
+    """Return the forces at the contacts, and the vector of each pair; a pair pulls by its tension times vector."""
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]
     return pull_signs(points.shape[1], points.device).to(points) @ (tension[..., None] * sides), sides
@@ -169,20 +173,20 @@ class ContactProblem:
         return cls(spec.fingertips, friction, spec.max_variance, radius, separation, table, tip_radius)
 
     def room(self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return how far each contact is above its least height, at which a round fingertip rests on the table."""
+        """Return the height (normalised) of each contact above its lowest place, where a round tip is on the table."""
         if self.table is None:
             return torch.full_like(points[..., 0], math.inf)
         slant = 1 - normals @ self.table.normal.to(normals)
         return self.table.height(points) - self.tip_radius * slant
 
     def sides(self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p 3"]:
-        """Return the vectors between fingertip centres, from the first to the second of each pair."""
+        """Return the vectors (normalised) from the first to the second fingertip centre of each pair of contacts."""
         centres = points + self.tip_radius * normals
         first, second = contact_pairs(points.shape[-2], points.device)
         return centres[..., second, :] - centres[..., first, :]
 
     def constraints(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Constraints:
-        """Evaluate all constraints and their Jacobians; `jet` holds the shape's values at the points."""
+        """Evaluate all constraints and their Jacobians; `jet` holds signed distance and variance at the points."""
         b, f = points.shape[:2]
         unknowns = 3 * f + tension.shape[1]
         own = functools.partial(_by_own_point, unknowns=unknowns)
@@ -208,7 +212,7 @@ class ContactProblem:
         return Constraints(points.mean(1), jet.distance, torch.cat(values, 1), *slopes)
 
     def _distances(self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]) -> Bounds:
-        """Return by how much each pair of fingertip centres is too close, with derivatives."""
+        """Return by how much each pair of fingertip centres is too close (negative if far enough), with derivatives."""
         sides = self.sides(points, normals)
         length = torch.linalg.vector_norm(sides, dim=-1)
         along = (sides / length[..., None])[..., None, :]
@@ -221,7 +225,7 @@ class ContactProblem:
         return self.separation / INSIDE - length, torch.cat([blocks.flatten(2), by_tension], 2)
 
     def _cones(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Bounds:
-        """Return by how much each force is outside its friction cone, as a cosine, with derivatives."""
+        """Return by how much each force is outside its friction cone, as a difference of cosines, with derivatives."""
         # With u = f / |f| the bound is n.u + cosine. It changes by (1 - u u^T) n / |f| with f, and by u with n.
         normals, at = jet.normals, torch.arange(points.shape[1], device=points.device)
         force, sides = forces_from_tensions(points, tension)
@@ -244,7 +248,7 @@ class ContactProblem:
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:
-    """Return the Jacobian of values, each of which depends only on its own contact, with respect to all unknowns."""
+    """Return the Jacobian by all unknowns of f values, each of which depends (by `slope`) only on its own contact."""
     b, f = slope.shape[:2]
     jacobian, at = slope.new_zeros(b, f, unknowns), torch.arange(f, device=slope.device)
     jacobian[:, :, : 3 * f].unflatten(2, (f, 3))[:, at, at] = slope

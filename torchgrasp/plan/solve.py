@@ -21,7 +21,7 @@ from torchgrasp.threads import single_threaded
 from torchgrasp.values import ContactPlan
 
 SEARCH = (Stage(3.0, 0.3, 10), Stage(1.0, 3.0, 6)) * 4 + (Stage(0.3, 0.3, 8), Stage(0.3, 3.0, 8))
-"""Stages from any start: weights of centre and cones, and steps. Each leads out of places where the other is stuck."""
+"""Stages from any initial guess: weights of centre and cones, steps. Each kind goes on where the other is stuck."""
 TO_CENTRE = (Stage(0.3, 3.0, 8, exact=False),)  # from candidates, most of which are feasible but for rounding
 LEAST_STARTS = 25  # fewest starts at a time under a time budget: with less, the overhead of each step outweighs them
 
@@ -36,18 +36,18 @@ def plan_contacts(
     *,
     time_budget: Positive | None = None,
 ) -> ContactPlan:
-    """Plan sets of `spec.fingertips` contacts, Eqs. (10)-(14), one set for each initial guess, in their order.
+    """Plan contact sets, Eqs. (10)-(14) of the paper: `spec.fingertips` contacts for each initial guess, in order.
 
     A failed set carries the `Status` of the first constraint that it violates. If the solver fails from a feasible
-    initial guess, the guess itself is the result. Without `time_budget` the result is deterministic, and a plan from
-    500 or 1000 starts is the beginning of a plan from more.
+    initial guess, the guess itself is the result. Without `time_budget` the result is deterministic, and the sets from
+    500 or 1000 initial guesses are the first sets of a plan from more.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
         spec: the constraints on contacts; `ContactSpec()` by default.
         starts: number of random initial guesses (Sec. 6.2), or the initial contact points [m].
         seed: random seed.
-        time_budget: wall time [s] of the call; at least 25 starts are planned. None plans all starts.
+        time_budget: wall time [s] of the call, in which at least 25 starts are planned; by default all are planned.
 
     Raises:
         BadArgument: `starts` not positive, of a wrong shape, or outside the shape's domain, or another wrong argument.

@@ -1,7 +1,7 @@
 """The solver of a `ContactProblem`: Levenberg-Marquardt steps along the surface.
 
-After every step one Newton step on the mean signed distance brings the points back to the surface. It costs a fraction
-of a full evaluation, and allows long steps.
+After every step one Newton step on the mean signed distance brings the points back to the surface. This projection
+costs a fraction of a full evaluation, and allows long steps.
 """
 
 import dataclasses
@@ -33,9 +33,10 @@ BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cone
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A solver stage: at most `steps` steps with weights of `centre` (Eq. 14) and friction `cones` (Eq. 13).
+    """A solver stage: at most `steps` steps, with weights for the offset from the `centre` and for friction `cones`.
 
-    A set stops when its step is shorter than `settled`. Unless `exact`, the variance is extrapolated linearly.
+    A contact set stops when its step (normalised) is shorter than `settled`. Unless `exact`, the variance of the
+    surface is extrapolated linearly.
     """
 
     centre: float
@@ -50,7 +51,7 @@ FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)  # th
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """The solver's state: normalised contacts, the tension between each pair, and the shape at the contacts."""
+    """The solver's state: normalised contact points, the tension of each pair, and the shape's values at the points."""
 
     points: Vectors
     tension: Float[Tensor, "b p"]
@@ -84,7 +85,7 @@ class Descent(Problem[State, LinearConstraints]):
     stage: Stage
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
-        """Evaluate the constraints at a state; satisfied bounds have weight 0."""
+        """Evaluate the constraints and their Jacobian at a state; satisfied inequalities have weight 0."""
         constraints = self.problem.constraints(state.points, state.tension, state.jet)
         bounds = torch.full_like(constraints.bounds, BOUNDS)
         bounds[:, : state.points.shape[1]] = self.stage.cones
@@ -97,7 +98,7 @@ class Descent(Problem[State, LinearConstraints]):
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside)
 
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
-        """Return the damped step, in which no point moves farther than `LONGEST_STEP`; NaN for a singular matrix."""
+        """Return each contact set's damped step (NaN for a singular matrix), and whether the step is long enough."""
         jacobian = model.weighted_jacobian
         scale = jacobian.new_ones(1, jacobian.shape[2])
         split_unknowns(scale)[1][:] = TENSION_DAMPING
@@ -123,14 +124,14 @@ class Descent(Problem[State, LinearConstraints]):
         return State(points, tension, SurfaceJet(**vars(mean), variance=variance, variance_gradient=slope))
 
     def judge(self, model: LinearConstraints, trial: LinearConstraints, x: Step, damping: Damping) -> Verdict:
-        """Return which steps lower the cost inside the domain, and the next damping (Nielsen's rule)."""
+        """Return a mask of the steps that lower the cost inside the domain, and the next damping (Nielsen's rule)."""
         kept = (model.cost - trial.cost) / promised_decrease(model, x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
         eased = damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
         return accepted, torch.where(accepted, eased.clamp(min=1e-9), (4 * damping).clamp(max=1e9))
 
     def refuse(self, model: LinearConstraints, trial: LinearConstraints) -> LinearConstraints:
-        """Return the model after a rejected step: its Jacobian is the mean of those at both ends of the step."""
+        """Return the model after a rejected step; its Jacobian is the mean of the Jacobians at the step's two ends."""
         # Near an observation a thin plate's normals change abruptly. The mean Jacobian points down along the kink.
         return dataclasses.replace(model, jacobian=(model.jacobian + trial.jacobian) / 2)
 
@@ -142,12 +143,12 @@ def promised_decrease(model: LinearConstraints, x: Step) -> Float[Tensor, "a"]:
 
 
 def descend(shape: Shape, problem: ContactProblem, state: State, stage: Stage) -> State:
-    """Run one solver stage; return the contacts after it."""
+    """Run one solver stage; return the state (contacts and tensions) after it."""
     return levenberg_marquardt(Descent(shape, problem, stage), state, stage.steps)[0]
 
 
 def project(shape: Shape, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:
-    """Move normalised points onto the surface f_d = 0 by Newton steps along the gradient."""
+    """Move normalised points onto the surface, where the signed distance is 0, by Newton steps along the gradient."""
     x = points.flatten(0, 1)
     for _ in range(steps):
         distance, gradient = shape.mean_and_gradient(x)

@@ -26,7 +26,7 @@ STARTS_PER_CHUNK = 500  # starts planned at once: memory is bounded, and a plan 
 
 
 def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor) -> None:
-    """Raise `BadArgument` for wrong initial guesses of `plan_contacts`."""
+    """Raise `BadArgument` for initial guesses with a wrong number of contacts, or outside the shape's domain."""
     if isinstance(starts, Tensor):
         if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
             allowed = f"as many as spec.fingertips: {spec.fingertips}"
@@ -42,18 +42,18 @@ def check_starts(shape: Shape, spec: ContactSpec, starts: int | Tensor) -> None:
 
 
 def given_starts(shape: Shape, starts: Vectors) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield the caller's initial contact points [m], moved onto the surface, in normalised units."""
+    """Yield chunks of the caller's initial contact points [m], moved onto the surface, in normalised units."""
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
 def chunk_sizes(starts: int) -> list[int]:
-    """Return the numbers of initial guesses that are planned at once."""
+    """Split a number of initial guesses into chunks that are planned at once; return the size of each chunk."""
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
 
 class Settled(NamedTuple):
-    """A specification with a known `flat_radius`, and candidates on flat surface with their normals.
+    """A specification with a known `flat_radius`, and p candidate contacts on flat surface, with their normals.
 
     `candidates` is None if the specification does not ask for flatness.
     """
@@ -65,8 +65,8 @@ class Settled(NamedTuple):
 def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
     """Yield random initial guesses on the surface in normalised units, `sizes[k]` at a time.
 
-    Without `spec.flatness` they are drawn as in the paper (Sec. 6.2). With it they are sets of candidate contacts,
-    because the centroid of contacts on flat surface may lie far from the object's centre.
+    Without `spec.flatness` the guesses are drawn as in the paper (Sec. 6.2). With flatness they are sets of candidate
+    contacts, because the centroid of contacts on flat surface may lie far from the object's centre.
     """
     (spec, candidates), generator = settled, torch.Generator().manual_seed(seed)
     if candidates is not None:
@@ -80,9 +80,9 @@ def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int
 
 
 def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
-    """Choose the largest `flat_radius` at which enough guesses have force closure, if none is given.
+    """Choose `flat_radius` if it is not given, as the largest with which enough guesses have force closure.
 
-    The candidates are the points at which the surface is flat, or all points of `survey` if too few are flat.
+    The candidates are the points at which the surface is flat, or all points of `survey` if too few points are flat.
     """
     if spec.flatness is None:
         return Settled(spec, None)
@@ -103,22 +103,23 @@ def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
 
 
 def draw(shape: Shape, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
-    """Return random points on the sphere of `spec.start_radius`, `size` of them, in normalised units."""
+    """Return random points on the sphere of `spec.start_radius`, in normalised units; `size` is (sets, contacts)."""
     points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64))
     return (spec.start_radius * points).to(device_of(shape))
 
 
 def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
-    """Return points all over the surface, among which candidates are found; for a vessel half of them on each wall."""
+    """Return points all over the surface, from which candidates are chosen; for a vessel, half are on each wall."""
     walls = walls_of(shape)
     drawn = draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator).tensor_split(len(walls))
     return torch.cat([project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)])
 
 
 def draw_in(shape: Shape, points: Vectors) -> Vectors:
-    """Return initial guesses in which contact sets far from the surface are moved close to their centroid.
+    """Move initial guesses that are far from the surface close to the centroid of their contacts.
 
-    From near the centroid the points spread over the surface around it; from afar they end on the nearest surface.
+    Points projected from near the centroid spread over the surface around it. Points from afar all end on the nearest
+    surface.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
@@ -129,7 +130,7 @@ def draw_in(shape: Shape, points: Vectors) -> Vectors:
 
 
 def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tensor, "b f"], Vectors]:
-    """Return which surface points are certain, in the domain and above the table; also all points' normals."""
+    """Return a mask of the points on the surface of low variance, in the domain, above the table; and all normals."""
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1)))
     normals = unit(gradient)
