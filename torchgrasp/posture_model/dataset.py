@@ -1,4 +1,4 @@
-"""Posture samples on disk: a folder of chunks, each drawn from (seed, chunk number) and written atomically."""
+"""Sampled hand postures on disk: a folder of chunk files, each drawn from (seed, chunk number), written atomically."""
 
 import dataclasses
 import json
@@ -36,9 +36,9 @@ Chunk = Annotated[int, Range(0, 1_000_000)]
 
 @dataclasses.dataclass(frozen=True)
 class SampleFolder:
-    """A complete folder of `n` posture samples; chunks are read on demand. `meta` is that of `HandSamples`.
+    """A complete folder of `n` sampled postures in chunk files that are read on demand; `meta` is as in `HandSamples`.
 
-    Iteration yields one chunk after another. By index the folder is a map-style dataset for
+    Iteration yields the chunks as `HandSamples`. By index the folder is a map-style dataset for
     `torch.utils.data.DataLoader`: item i holds the joints (h,) and the code (6,) of posture i. Recent chunks stay in
     memory.
 
@@ -60,7 +60,7 @@ class SampleFolder:
         return self.n
 
     def __getitem__(self, i: int) -> tuple[Tensor, Tensor]:
-        """Return joints and code of posture i; raises `IndexError` beyond the last, `ModelFileError` as `chunk`."""
+        """Return joints, code of posture i; raises `IndexError` beyond the last, `ModelFileError` as `chunk` does."""
         chunk, row = divmod(range(self.n)[operator.index(i)], CHUNK_POSTURES)
         samples = self.recent.get(chunk, self.chunk)
         return samples.joints[row], samples.q[row]
@@ -85,14 +85,14 @@ class SampleFolder:
 
     @checked
     def read(self, n: Count | None = None) -> HandSamples:
-        """Read the first `n` postures into memory; by default all. Raises `BadArgument` for n outside [1, len]."""
+        """Read the first `n` postures, or all by default, into memory. Raises `BadArgument` for n outside [1, len]."""
         n = self.n if n is None else n
         check_whole("n", n, 1, self.n)
         return join([self.chunk(i) for i in range(len(chunk_sizes(n)))])[:n]
 
     @checked
     def path(self, i: Chunk) -> Path:
-        """Return the file of chunk i."""
+        """Return the path of the file of chunk i."""
         return self.folder / f"chunk-{i:06d}.safetensors"
 
     @checked
@@ -113,10 +113,10 @@ def write_samples(
     workers: Annotated[int, Range(1, 1024)] = 1,
     observer: Callable[[int], object] = lambda count: None,
 ) -> SampleFolder:
-    """Write the samples of `sample_configurations` to a folder, chunk by chunk.
+    """Draw random postures of a hand as `sample_configurations` does, and write them to a folder, chunk by chunk.
 
     The same call continues an interrupted run. `workers` threads draw at the same time. The observer is called with the
-    number of postures on disk at the start, then with the size of each new chunk.
+    number of postures on disk at the start, then with the number of postures in each new chunk.
 
     Raises:
         BadArgument: workers outside [1, 1024], or a hand of which almost all postures collide.
@@ -179,7 +179,7 @@ def load_samples(folder: Path | str) -> SampleFolder:
 
 
 def _parse_manifest(folder: Path, manifest: Field) -> SampleFolder:
-    """Return the sample folder that a manifest describes."""
+    """Return the sample folder that a manifest (the JSON file of the folder) describes."""
     fixed = {"torchgrasp": "samples", "version": 1, "chunk": CHUNK_POSTURES}
     fields = manifest.entries()
     if any(key not in fields or fields[key].value != value for key, value in fixed.items()):

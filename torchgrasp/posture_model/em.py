@@ -1,8 +1,8 @@
 """Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in each process that torchrun started.
 
-The data are standardised to mean 0 and variance 1 in every column, because the features below would otherwise cancel.
 The log-density of a Gaussian is linear in the features [1, x_i, x_i x_j], so each step is one matrix product. Sums of
-the features, weighted by responsibilities, suffice for the maximisation and are small enough to add over processes.
+the features, weighted by responsibilities, suffice for the maximisation and are small enough to add over processes. The
+data must have mean 0 and variance 1 in every column; otherwise differences of such sums would lose their digits.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ MAX_RESEEDS = 3  # a component that collapses more often shows that the data sup
 
 @dataclasses.dataclass(frozen=True)
 class Shard:
-    """The data rows of one process of several, which form the default group of torch.distributed."""
+    """The data rows of one process; several processes form the default group of torch.distributed."""
 
     rows: Float[Tensor, "n d"]
     rank: int = 0
@@ -33,7 +33,7 @@ class Shard:
 
     @staticmethod
     def of(rows: Float[Tensor, "n d"], distributed: bool) -> "Shard":
-        """Return the shard of this process; raises `BadArgument` if `distributed` without a process group."""
+        """Return the shard of this process; raises `BadArgument` if `distributed` is True without a process group."""
         if not distributed:
             return Shard(rows)
         if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
@@ -71,7 +71,7 @@ class Progress(Value):
     """The state of a fit. The state and the data determine the next step.
 
     `reseeded` counts how often each component collapsed and was placed anew; the likelihood may fall after that.
-    `log_likelihood` [nats] is the mean over the data before each step.
+    `log_likelihood` [nats] is the mean over the data before each step. `jumped`: a component was placed anew just now.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
     >>> Progress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
@@ -86,7 +86,7 @@ class Progress(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Fit(Progress):
-    """The result of a fit; its last log-likelihood is that of the final components."""
+    """The result of a fit; the last log-likelihood belongs to the final components."""
 
     converged: bool = False
 
@@ -99,9 +99,9 @@ def expectation_maximisation(
     regularisation: float,
     observer: Callable[[Progress], None] = lambda progress: None,
 ) -> Fit:
-    """Run EM steps until a step raises the mean log-likelihood by less than `tolerance` [nats].
+    """Fit a mixture by EM steps until a step raises the mean log-likelihood by less than `tolerance` [nats].
 
-    `iterations` bounds the number of steps, including those before `start`. `regularisation` is added to every
+    `iterations` bounds the number of steps, including the steps before `start`. `regularisation` is added to every
     variance. Raises `IndefiniteCovariance` for an indefinite start, or a component that collapses too often.
     """
     n, state = shard.count(), start
@@ -117,7 +117,7 @@ def expectation_maximisation(
 
 
 def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
-    """Return the sums of the features weighted by responsibilities, and the log-likelihood of all data, Eq. (19)."""
+    """Return for each component the features summed with its responsibilities, and the log-likelihood of all data."""
     x, coefficients = shard.rows, coefficients_from_components(components)
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
     at_once = min(CACHED_ROWS if x.device.type == "cpu" else 2**17, len(x))  # smaller passes leave a GPU idle
@@ -147,7 +147,7 @@ def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None
 
 
 def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]:
-    """Return the coefficients of the features in log(weight) + log N(x | mean, covariance), Eq. (19)."""
+    """Return for each component the coefficients of the features in log(weight) + log N(x | mean, covariance)."""
     means, d = components.means, components.means.shape[1]
     whitening = whitening_matrices(components.covariances)
     precision = whitening.transpose(-1, -2) @ whitening
@@ -164,8 +164,8 @@ def maximisation(
 ) -> tuple[Components, Int[Tensor, "m"]]:
     """Return the maximum-likelihood components from the weighted sums, and how often each has collapsed.
 
-    A component collapses if its covariance is singular or it has fewer than d + 1 rows. Half of the heaviest, split
-    across its longest axis, replaces it, at most `MAX_RESEEDS` times: then `IndefiniteCovariance` is raised.
+    A component collapses if its covariance is singular or it has fewer than d + 1 rows. It is replaced by half of the
+    heaviest component, split across its longest axis. After `MAX_RESEEDS` times, `IndefiniteCovariance` is raised.
     """
     components = components_from_sums(sums, n, regularisation)
     weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()
@@ -205,7 +205,7 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
 
 
 def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
-    """Return m initial components, the clusters of k-means; raises `BadArgument` for fewer than m distinct rows."""
+    """Return the initial state of a fit: m components from k-means. Raises `BadArgument` for fewer distinct rows."""
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
     for _ in range(10):  # Lloyd's algorithm: EM follows, so the clusters need not converge
@@ -218,7 +218,7 @@ def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> 
 
 
 def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]:
-    """Return random rows of the data of all processes, the same in every process."""
+    """Return random data rows, drawn from all processes; every process gets the same rows."""
     x, lengths = shard.rows, shard.rows.new_zeros(shard.processes, dtype=torch.int64)
     lengths[shard.rank] = len(x)
     lengths = shard.sum(lengths)
@@ -231,7 +231,7 @@ def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]
 
 
 def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -> Float[Tensor, "m d"]:
-    """Return m initial cluster centres by k-means++."""
+    """Return m initial cluster centres, drawn from the rows of `pool` by k-means++."""
     centres = pool[:1]
     squared = ((pool - centres) ** 2).sum(1)
     for k in range(1, m):
@@ -246,7 +246,7 @@ def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -
 def _sums_of_clusters(
     shard: Shard, centres: Float[Tensor, "m d"], features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]]
 ) -> Float[Tensor, "m f"]:
-    """Return the sums of the features over the rows of each cluster."""
+    """Return the sums of the features over each cluster: the rows whose nearest centre it has."""
     sums = centres.new_zeros(len(centres), len(features(centres[:1])))
     for rows in shard.rows.split(CACHED_ROWS):
         nearest = (0.5 * (centres**2).sum(1) - rows @ centres.T).argmin(1)

@@ -44,7 +44,7 @@ class Checkpoint:
         save_tensors(self.path, "em", tensors, {**self.settings, "jumped": str(progress.jumped)})
 
     def load(self) -> Progress | None:
-        """Return the saved state, or None; raises `ModelFileError`, or `BadArgument` for the state of another fit."""
+        """Return the saved state, or None without a file; raises `ModelFileError`, `BadArgument` for another fit's."""
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
         # Processes at different steps would wait for each other for ever. Equal steps have no variance.
@@ -93,22 +93,24 @@ def fit_mixture(
 ) -> GraspMixture:
     """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation, initialised by k-means.
 
-    The mixture's `meta` reports iterations, convergence, collapsed components, mean log-likelihood and BIC. Codes are
-    exact functions of the joints, so BIC keeps falling with more components: use its elbow, not its minimum.
+    The mixture's `meta` reports iterations, convergence, collapsed components, mean log-likelihood and the Bayesian
+    information criterion (BIC). Codes are exact functions of the joints, so the BIC keeps falling with more components:
+    use its elbow, not its minimum.
 
     Args:
+        samples: joints [rad] and fingertip codes of postures of one hand.
         components: number m of Gaussians.
         iterations: largest number of steps.
         tolerance: stop when a step raises the mean log-likelihood by less [nats].
         regularisation: variance added to every dimension of a component, relative to its variance over all samples.
-        starts: number of k-means initialisations, with consecutive seeds. After `TRIAL_STEPS` steps of each the
-            likeliest continues.
+        starts: number of k-means initialisations, with consecutive seeds. After a few steps of each, the fit of the
+            greatest likelihood continues.
         checkpoint: file that stores the fit after every step. A fit that continues from it gives the same bits.
-        distributed: whether `samples` are the part of one process under torchrun. All processes must see the same
+        distributed: whether `samples` are only the part of this process under torchrun. All processes must see the same
             checkpoint.
 
     Raises:
-        BadArgument: too few samples, a joint that does not vary, a number out of range, the checkpoint of another fit.
+        BadArgument: too few samples, a joint that does not vary, a number out of range, or another fit's checkpoint.
         ModelFileError, OutputError: a damaged checkpoint, or one that cannot be written.
         IndefiniteCovariance: a component collapsed more than three times.
 
@@ -159,7 +161,7 @@ def fit_mixture(
 
 
 def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
-    """Scale every column to mean 0 and variance 1 in place; return the original means and standard deviations."""
+    """Scale every data column to mean 0 and variance 1 in place; return the original means and standard deviations."""
     x, n = shard.rows, shard.count()
     centre = shard.sum(x.sum(0)) / n
     x.sub_(centre)

@@ -66,7 +66,7 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return log(pi_i) + log N(x | mu_i, Sigma_i) for every row and component."""
+        """Return log(weight) + log N(x | mean, covariance), the log joint density, for every row x and component."""
         return self.weights.double().log() + (self.whitening.log_scale - 0.5 * self.whitening.squared(x.double()))
 
     @checked
@@ -93,7 +93,7 @@ class GaussianMixture(Value):
 
     @checked
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the mixture of the other dimensions, given the values of some: bracket and h_i of Eq. (23).
+        """Return the mixture of the other dimensions, given the values of some by name, Eq. (23) of the paper.
 
         Components of weight 0 are left out. Raises `BadArgument` for unknown names or non-finite values.
         """
@@ -127,7 +127,7 @@ class GaussianMixture(Value):
 
     @functools.cached_property
     def whitening(self) -> "Whitening":
-        """The whitened components, for the evaluation of densities."""
+        """The components in whitened form, in which densities are quick to evaluate."""
         means, d, matrix = self.means.double(), len(self.names), whitening_matrices(self.covariances.double())
         log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * d * math.log(2 * math.pi)
         return Whitening(matrix, (matrix @ means[..., None])[..., 0], log_scale)
@@ -141,14 +141,14 @@ class GaussianMixture(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Whitening:
-    """m Gaussians in whitened form: `matrix` W with W^T W = Sigma^-1, `means` W mu, and log-normalisers."""
+    """m Gaussians in whitened form: `matrix` W with W^T W = covariance^-1, `means` W mean, and logs of normalisers."""
 
     matrix: Float[Tensor, "m d d"]
     means: Float[Tensor, "m d"]
     log_scale: Float[Tensor, "m"]
 
     def squared(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return the squared Mahalanobis distance between every row and component."""
+        """Return the squared Mahalanobis distance of every row from the mean of every component."""
         m, d = self.means.shape
         whitened = (x @ self.matrix.reshape(m * d, d).T).reshape(-1, m, d) - self.means
         return (whitened * whitened).sum(-1)
@@ -161,7 +161,7 @@ def map_rows(function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor
 
 
 def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:
-    """Return the lower-triangular W with W^T W = Sigma^-1; raises `IndefiniteCovariance`."""
+    """Return for each covariance the lower-triangular W with W^T W = covariance^-1; raises `IndefiniteCovariance`."""
     factor = cholesky(covariances, "a component's covariance", "use fewer components or more samples")
     eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
     return torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)

@@ -31,7 +31,7 @@ def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*
     """Return the rigid-motion-invariant code q = (L, N) of points with unit normals, Eq. (18).
 
     L_i is the distance [m] of point i from the centroid; N holds the cosines n1.n2, n1.n3, n2.n3 and so on. Fingertips
-    have the code of the contacts that they touch. Mirror images share it too: check every match.
+    have the same code as the contacts that they touch. Mirror images have this code too: check every match.
     """
     lengths = torch.linalg.vector_norm(points - points.mean(-2, keepdim=True), dim=-1)
     cosines = torch.stack([(n * m).sum(-1) for n, m in itertools.combinations(normals.unbind(-2), 2)], dim=-1)
@@ -42,8 +42,8 @@ def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     """Return the codes of contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
 
-    Points [m] and unit normals have shape (b, 3, 3). A triple without a virtual frame gives NaN and
-    `Status.DEGENERATE`.
+    A code is three lengths [m] and three cosines, which no rigid motion changes. Points [m] and unit normals have shape
+    (b, 3, 3). Contacts on a line give NaN and `Status.DEGENERATE`.
 
     Raises:
         BadArgument: wrong shapes, non-finite numbers, or normals whose length is not 1 within 1e-3.
@@ -98,7 +98,7 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
 
 
 def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
-    """Return the codes (Eqs. 15-18) of three fixed postures: a fingerprint of the hand."""
+    """Return the codes (Eqs. 15-18) of three fixed postures, which identify the hand."""
     lower, upper = hand.lower.double(), hand.upper.double()
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
     index = (torch.arange(hand.dof)[None] + torch.arange(3)[:, None]) % 3
@@ -110,9 +110,9 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
 class GraspMixture(GaussianMixture):
     """The learned mixture over the joints and contact codes of one hand (Eqs. 19-20).
 
-    The dimensions are the joints [rad], in the hand's order, then the code L1 L2 L3 [m] N1 N2 N3; the names must end
-    with `CODE_NAMES`. `regularisation` was added to every variance, relative to the samples' variance. `meta` describes
-    hand, samples and fit.
+    The dimensions are the joints [rad], in the hand's order, then the contact code: lengths L1 L2 L3 [m], cosines N1 N2
+    N3. The names must end with `CODE_NAMES`. `regularisation`, relative to the samples' variance, was added to every
+    variance. `meta` describes hand, samples and fit.
 
     >>> from torchgrasp import encode
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -136,33 +136,33 @@ class GraspMixture(GaussianMixture):
 
     @functools.cached_property
     def _code(self) -> GaussianMixture:
-        """The marginal density of the code, Eq. (22)."""
+        """The marginal mixture of the contact code, Eq. (22)."""
         return self.marginal(CODE_NAMES)
 
     @functools.cached_property
     def _regression(self) -> Float[Tensor, "m h 6"]:
-        """Regression of the joints on the code in each component: Sigma_(Theta,q) Sigma_q^-1 of Eq. (23)."""
+        """The slope of each component's mean joints over the code: Sigma_(Theta,q) Sigma_q^-1 of Eq. (23)."""
         whitening = self._code.whitening.matrix
         return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
 
     @functools.cached_property
     def _stacked_regression(self) -> Float[Tensor, "k h"]:
-        """The conditional means of all components as stacked matrices that multiply (q, 1)."""
+        """Matrices, stacked over components, that multiply (q, 1) to give each component's mean joints at a code q."""
         at_zero = self.means[:, :-6].double() - (self._regression @ self.means[:, -6:, None].double())[..., 0]
         return torch.cat([self._regression.transpose(1, 2), at_zero[:, None]], 1).flatten(0, 1)
 
     @checked
     def energy(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b"]:
-        """Return min_i f_i of Eq. (21): half the squared Mahalanobis distance to the nearest component.
+        """Return half the squared Mahalanobis distance of each code from the nearest component, min f_i of Eq. (21).
 
-        The hand probably reaches a code if this value is below `DEFAULT_ENERGY`, or the paper's `PAPER_ENERGY`. NaN
-        gives NaN.
+        The hand probably reaches a code if this value is below `DEFAULT_ENERGY`, or the paper's `PAPER_ENERGY`. A code
+        with NaN gives NaN.
         """
         return map_rows(lambda q: 0.5 * self._code.whitening.squared(q).amin(-1), _codes(code))
 
     @checked
     def joints(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b h"]:
-        """Return the expected joints [rad] given a code, Eq. (23); they may exceed the limits. NaN gives NaN."""
+        """Return the expected joints [rad] given each code, Eq. (23); they may exceed the limits. NaN gives NaN."""
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
             # sum_i h_i A_i (q, 1) as one matrix product
@@ -176,7 +176,7 @@ class GraspMixture(GaussianMixture):
     def modes(
         self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
     ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
-        """Return the joint means of the k components most responsible for a code, and their h_i of Eq. (23).
+        """Return mean joints [rad] and responsibilities (h_i, Eq. 23) of the k components most responsible for a code.
 
         Use them where several postures have the same code: the expected joints may then be none of these postures.
         Raises `BadArgument` for k outside [1, m].
@@ -195,7 +195,7 @@ class GraspMixture(GaussianMixture):
         return modes[..., :-1], modes[..., -1]
 
     def _log_responsibility(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m"]:
-        """Return log h_i of Eq. (23), without underflow far from every component."""
+        """Return the log of each component's responsibility h_i for a code (Eq. 23), without underflow far from all."""
         return torch.log_softmax(self._code.log_joint(q), dim=-1)
 
     @checked

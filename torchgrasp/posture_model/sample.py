@@ -1,6 +1,6 @@
 """Random postures of a hand without self-collision: the training data of its learned model (Sec. 4.1).
 
-Round fingertips roll, so contacts may lie beside the middle of a pad. The contacts of a posture must allow closure.
+Round fingertips roll, so "grasping" samples have contacts beside the middle of a pad, which must allow force closure.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ def roll_contacts(
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
     """Return random contact points [m] and outward normals of fingertips that touch beside the middle of their pads.
 
-    Both tilts of a contact direction are Gaussian, truncated to the pad's cone. The contact of a round tip follows.
+    Both tilts of a contact direction are Gaussian, truncated to the pad's cone. The contact of a round tip moves along.
     """
     points, axes = hand.fingertips(joints)
     cone, radius = hand.tips.cone.to(axes), hand.tips.radius.to(axes)
@@ -46,7 +46,7 @@ def roll_contacts(
 
 
 def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -> Bool[Tensor, "n"]:
-    """Return which postures have three contacts that balance forces inside the friction cones, Eq. (13).
+    """Return a mask of the postures of which some three contacts can balance forces in the friction cones, Eq. (13).
 
     A grid over forces along the triangle's sides finds all but marginal closures; `normals` point into the object.
     """
@@ -58,7 +58,7 @@ def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -
 
 
 def _close_triples(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3"]) -> Bool[Tensor, "n"]:
-    """Return which contact triples balance forces inside their friction cones."""
+    """Return a mask of the contact triples that can balance forces inside their friction cones."""
     spread = 1 + ContactSpec().friction ** 2
     t12, t13, t23 = fibonacci_sphere(BALANCES).to(points).T
     e12, e13, e23 = (unit(points[:, j] - points[:, i]) for i, j in ((0, 1), (0, 2), (1, 2)))
@@ -76,7 +76,7 @@ BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for t
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
 
 Sampling = Literal["uniform", "grasping"]
-"""Which free postures are taken.
+"""Which of the random postures without self-collision are taken.
 
 * "uniform": all postures are taken, as in the paper. Their fingertips touch with the middle of their pads.
 * "grasping": postures are taken whose contacts, where the rolled fingertips touch, can have force closure.
@@ -86,7 +86,7 @@ Sampling = Literal["uniform", "grasping"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """Postures of one hand, `joints` [rad], and their codes `q` (Eq. 18); `meta` names hand, seed and sampling.
+    """Postures of one hand: `joints` [rad] and fingertip codes `q` (Eq. 18); `meta` names hand, seed and sampling.
 
     >>> from torchgrasp import load_hand
     >>> samples = sample_configurations(load_hand("barrett"), 50)
@@ -100,16 +100,16 @@ class HandSamples(Batch):
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def rows(self) -> Float[Tensor, "n d"]:
-        """Return joints and codes, concatenated."""
+        """Return one row for each posture: its joints, then its code."""
         return torch.cat([self.joints, self.q], dim=-1)
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
-    """Which n collision-free postures are drawn; see `Sampling`.
+    """The settings by which `n` postures without self-collision are drawn; `Sampling` lists the kinds.
 
-    Chunk i depends only on (seed, i), so a smaller set of samples is the beginning of a larger one. Raises
+    Chunk i depends only on (seed, i), so a smaller set of samples is the beginning of a larger set. Raises
     `BadArgument` for values out of range.
 
     >>> from torchgrasp import load_hand
@@ -123,7 +123,7 @@ class SampleSpec(Value):
 
     @checked
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return metadata that identifies the samples: hand, seed and sampling, without their number."""
+        """Return metadata that identifies the samples: hand, seed and sampling, without the number of samples."""
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
 
@@ -136,10 +136,10 @@ def sample_configurations(
     sampling: Sampling = "uniform",
     observer: Callable[[int], object] = lambda count: None,
 ) -> HandSamples:
-    """Draw random postures within the joint limits, and keep those free of self-collision (Sec. 6.3).
+    """Draw random postures within the joint limits, and keep `n` postures free of self-collision (Sec. 6.3).
 
     `SampleSpec` explains n, seed and sampling. The observer is called with the size of every new chunk. Raises
-    `BadArgument` for an argument out of range, or a hand of which almost all postures collide.
+    `BadArgument` for an argument out of range, or a hand that collides with itself in almost all postures.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape
@@ -158,12 +158,12 @@ def sample_configurations(
 
 
 def chunk_sizes(n: int) -> list[int]:
-    """Return the number of postures in each chunk: `CHUNK_POSTURES`, the last chunk has the rest."""
+    """Split n postures into chunks of `CHUNK_POSTURES`, of which the last has the rest; return the sizes."""
     return [min(CHUNK_POSTURES, n - first) for first in range(0, n, CHUNK_POSTURES)]
 
 
 def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
-    """Return the kept postures of chunk i, their codes, and how many postures were drawn to find them."""
+    """Return joints [rad] and codes of the postures of chunk i, and how many postures were drawn to find them."""
     least_kept = 1e-3  # least share of postures that are kept, after ten blocks: another hand would draw for hours
     count, parts, kept = chunk_sizes(spec.n)[i], [], 0
     blocks = _draw_blocks(hand, np.random.default_rng((spec.seed, i)), spec.sampling)
@@ -179,7 +179,7 @@ def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h
 def _draw_blocks(
     hand: Hand, generator: np.random.Generator, sampling: Sampling
 ) -> Iterator[tuple[Float[Tensor, "n h"], Float[Tensor, "n q"]]]:
-    """Yield blocks of kept postures with their codes, without end."""
+    """Yield blocks of suitable random postures (joints [rad], codes) without end."""
     lower, upper = hand.lower.double(), hand.upper.double()
     while True:
         uniform = torch.from_numpy(generator.random((BLOCK_POSTURES, hand.dof))).to(lower.device)

@@ -1,4 +1,4 @@
-"""Quality of a learned model: errors on held-out postures (Sec. 6.3), and the BIC over model size (Fig. 6)."""
+"""Quality of a learned model: errors on held-out postures (Sec. 6.3), and the BIC by number of components (Fig. 6)."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -20,14 +20,14 @@ COMPARED_MODES = 4  # modes of which the nearest is compared: a code has a few p
 
 @dataclasses.dataclass(frozen=True)
 class MixtureScore(Value):
-    """Errors of a model on held-out postures.
+    """Errors with which a learned model predicts the joints of held-out postures from their codes.
 
     Args:
         joint_names: names of the joints.
-        error: mean absolute error of the conditional mean, Eq. (23), of each joint [rad].
+        error: mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23).
         deviation: standard deviation of the absolute error over the postures [rad].
-        nearest_mode: mean absolute error of the best of the first `COMPARED_MODES` modes [rad].
-        paper_coverage, default_coverage: fractions of codes below `PAPER_ENERGY` and `DEFAULT_ENERGY`.
+        nearest_mode: mean absolute error [rad] of the best of the `COMPARED_MODES` likeliest `GraspMixture.modes`.
+        paper_coverage, default_coverage: fractions of codes of energy below `PAPER_ENERGY` and `DEFAULT_ENERGY`.
         log_likelihood: mean log-likelihood of a posture [nats].
         postures: number of postures.
     """
@@ -72,7 +72,7 @@ class MixtureScore(Value):
 
 
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
-    """Return the errors of a model on held-out postures, at least two."""
+    """Return the errors of a model on held-out postures; there must be at least two postures."""
     if samples.joint_names != mixture.joint_names:
         raise BadArgument("samples", f"joints {samples.joint_names}", f"the mixture's {mixture.joint_names}")
     if len(samples) < 2:
@@ -126,7 +126,7 @@ def bic_curve(
         components: numbers of components to try.
         checkpoints: folder for the checkpoints of all fits; an interrupted call continues from them.
         observer: called after each fit with its number of components and its mixture.
-        fit: seed, iterations, tolerance and regularisation of `fit_mixture`.
+        fit: more arguments of `fit_mixture`: seed, iterations, tolerance and regularisation.
     """
     if not components:
         raise BadArgument("components", "none", "at least one number")
