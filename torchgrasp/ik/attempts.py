@@ -68,7 +68,7 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return each contact set's best result (least first key, in a tie least next key), and the set's index."""
+        """Return each contact set's best result, with the least key (in a tie the next key), and the set's index."""
         results, row = join(self.results), torch.cat(self.rows)
         first = rank_in_group(row, *keys(results)) == 0
         return results[first], row[first]
@@ -80,7 +80,7 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return each contact set's best grasp, and the set's index: a success if any, else a failure on valid contacts."""
+    """Return each contact set's best grasp, and the set's index: a success, else a failure on valid contacts."""
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~executable(grasps)
@@ -163,7 +163,7 @@ class CobylaRun:
         self.last: tuple[bytes, float, np.ndarray] | None = None
 
     def place(self, x: np.ndarray) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
-        """Return joints within limits, link frames in the hand, the hand's pose (Eq. 24), whether the pose exists."""
+        """Return joints, link frames and hand pose (Eq. 24) at COBYLA's variables `x`, and whether the pose exists."""
         step = ANGLE * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
         joints = (self.first + step).clamp(self.hand.lower.to(step), self.hand.upper.to(step))
         frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())

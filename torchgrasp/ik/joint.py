@@ -47,7 +47,7 @@ STAGES = (Stage(5, False, 1e5), Stage(6, True, 1e4), Stage(7, True, 500.0), Stag
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """Hand configurations, contact points (normalised), tensions; `variance` is extrapolated from the stage's start."""
+    """Hand configurations, normalised contact points, tensions of contact pairs, extrapolated surface variance."""
 
     configuration: Configuration
     points: Float[Tensor, "g f 3"]
@@ -67,7 +67,7 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """The least-squares problem of hand and contacts together: hand, object shape, contact specification, world."""
+    """The least-squares problem of hand and contacts together: hand, object shape, contact `spec`, collision world."""
 
     hand: Hand
     shape: Shape

@@ -200,8 +200,8 @@ def query_mixture(
 
     An assignment of contacts to fingers is reachable if its energy (Eq. 21) is below `max_energy`. Each reachable
     assignment gives `n_seeds` seeds: the mean joints given the contacts (Eq. 23), and the mean joints of the most
-    responsible components. The seeds of a contact set that touch the surface from outside come first, then seeds of
-    small tip error. A contact set without a reachable assignment has no seeds.
+    responsible components. The seeds of a contact set are sorted: seeds that touch the surface from outside come
+    first, then by tip error. A contact set without a reachable assignment has no seeds.
 
     Raises:
         BadArgument: the mixture is of another hand, or of other joint limits or fingertips; a number is out of range,

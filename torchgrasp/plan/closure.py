@@ -180,7 +180,7 @@ def closed_exact(points: Vectors, normals: Vectors, friction: float, guess: Gues
 
 
 def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[Tensor, "b m"]:
-    """Return the coefficients of greatest margin that balance cones with few edges; arbitrary if none balance them."""
+    """Return coefficients that balance wrenches of few cone edges with the greatest margin; arbitrary if none do."""
     return solve_closure_lp(wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2))[0]
 
 

@@ -66,8 +66,8 @@ def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[T
 class FlatnessConstraint(Batch):
     """A linear model, near the contact points `at`, of k constraint values that are <= 0 where the surface is flat.
 
-    `by_points` holds their derivatives by the 3 f coordinates of a contact set. To make this model costs as much as
-    several solver steps: make it rarely.
+    `by_points` holds their derivatives by the 3 f coordinates of a contact set. To build this model costs as much as
+    several solver steps, so build it rarely.
     """
 
     value: Float[Tensor, "b k"]
@@ -80,10 +80,10 @@ class FlatnessConstraint(Batch):
 
 
 def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
-    """Return by how much the normals around each contact differ from its normal beyond the angle `flatness` [rad].
+    """Model by how much the normals around each contact differ from its normal beyond the angle `flatness` [rad].
 
     A value is |n - n_k|, for the normals n at a contact and n_k on a ring of `radius` [m] around it, less the chord of
-    `flatness`. It is multiplied by the ring's radius in normalised units, and so is a length.
+    the angle `flatness`. It is multiplied by the ring's radius in normalised units, and so is a length.
     """
     (first, _), *others = walls_at(shape, points)
     found = _wall_constraint(first, points, flatness, radius)
@@ -95,7 +95,7 @@ def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: 
 
 
 def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
-    """Return the flatness constraint for contacts on one surface."""
+    """Return the result of `flatness_constraint` for contacts on one surface."""
     jet, radius = triple_mean_jet(shape, points), radius / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)

@@ -136,7 +136,7 @@ class Constraints(Batch):
 
 
 def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
-    """Return the forces at the contacts, and the vector of each pair; a pair pulls by its tension times vector."""
+    """Return the forces at the contacts, and the vector of each pair; a pair pulls by tension times vector."""
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]
     return pull_signs(points.shape[1], points.device).to(points) @ (tension[..., None] * sides), sides
@@ -173,7 +173,7 @@ class ContactProblem:
         return cls(spec.fingertips, friction, spec.max_variance, radius, separation, table, tip_radius)
 
     def room(self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the height (normalised) of each contact above its lowest place, where a round tip is on the table."""
+        """Return how high (normalised) each contact is above the height at which its round tip touches the table."""
         if self.table is None:
             return torch.full_like(points[..., 0], math.inf)
         slant = 1 - normals @ self.table.normal.to(normals)

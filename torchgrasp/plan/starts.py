@@ -130,7 +130,7 @@ def draw_in(shape: Shape, points: Vectors) -> Vectors:
 
 
 def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tensor, "b f"], Vectors]:
-    """Return a mask of the points on the surface of low variance, in the domain, above the table; and all normals."""
+    """Return a mask of usable points (on the surface, of low variance, in the domain, above table), and all normals."""
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1)))
     normals = unit(gradient)

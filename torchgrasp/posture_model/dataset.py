@@ -60,7 +60,7 @@ class SampleFolder:
         return self.n
 
     def __getitem__(self, i: int) -> tuple[Tensor, Tensor]:
-        """Return joints, code of posture i; raises `IndexError` beyond the last, `ModelFileError` as `chunk` does."""
+        """Return joints and code of posture i; raises `IndexError` beyond the last, `ModelFileError` as `chunk`."""
         chunk, row = divmod(range(self.n)[operator.index(i)], CHUNK_POSTURES)
         samples = self.recent.get(chunk, self.chunk)
         return samples.joints[row], samples.q[row]

@@ -71,7 +71,7 @@ class Progress(Value):
     """The state of a fit. The state and the data determine the next step.
 
     `reseeded` counts how often each component collapsed and was placed anew; the likelihood may fall after that.
-    `log_likelihood` [nats] is the mean over the data before each step. `jumped`: a component was placed anew just now.
+    `log_likelihood` [nats] is the mean over the data before each step. `jumped`: the last step placed a component anew.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
     >>> Progress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
@@ -246,7 +246,7 @@ def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -
 def _sums_of_clusters(
     shard: Shard, centres: Float[Tensor, "m d"], features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]]
 ) -> Float[Tensor, "m f"]:
-    """Return the sums of the features over each cluster: the rows whose nearest centre it has."""
+    """Return for each cluster the sum of the features of its rows; a row belongs to the nearest centre."""
     sums = centres.new_zeros(len(centres), len(features(centres[:1])))
     for rows in shard.rows.split(CACHED_ROWS):
         nearest = (0.5 * (centres**2).sum(1) - rows @ centres.T).argmin(1)

@@ -44,7 +44,7 @@ class Checkpoint:
         save_tensors(self.path, "em", tensors, {**self.settings, "jumped": str(progress.jumped)})
 
     def load(self) -> Progress | None:
-        """Return the saved state, or None without a file; raises `ModelFileError`, `BadArgument` for another fit's."""
+        """Return the saved state, or None without a file; raises `ModelFileError`, or `BadArgument` for another fit."""
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
         # Processes at different steps would wait for each other for ever. Equal steps have no variance.

@@ -71,7 +71,7 @@ class GaussianMixture(Value):
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
-        """Draw n random rows; raises `BadArgument` for n or seed out of range."""
+        """Draw n random samples, one in each row; raises `BadArgument` for n or seed out of range."""
         generator = torch.Generator().manual_seed(seed)
         weights, means = self.weights.double().cpu(), self.means.double().cpu()
         draw = torch.rand(n, generator=generator, dtype=torch.float64)

@@ -86,7 +86,7 @@ Sampling = Literal["uniform", "grasping"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """Postures of one hand: `joints` [rad] and fingertip codes `q` (Eq. 18); `meta` names hand, seed and sampling.
+    """Postures of one hand: `joints` [rad], fingertip codes `q` (lengths [m], cosines); `meta`: hand, seed, sampling.
 
     >>> from torchgrasp import load_hand
     >>> samples = sample_configurations(load_hand("barrett"), 50)
