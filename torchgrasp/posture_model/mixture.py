@@ -23,8 +23,10 @@ from torchgrasp.values import ContactCode, Contacts
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
 """The six assignments of three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
 CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")  # the numbers of a code q = (L, N): three lengths [m], three cosines
-PAPER_ENERGY = 2.0  # the paper's threshold on f_i of Eq. (21)
-DEFAULT_ENERGY = 6.295793622  # half the 95 % quantile of chi-square with six degrees of freedom
+PAPER_ENERGY = 2.0
+"""The paper's greatest energy f_i, Eq. (21), of a code that the hand reaches."""
+DEFAULT_ENERGY = 6.295793622
+"""The greatest energy of a reached code, by default: half the 95 % quantile of chi-square with 6 degrees of freedom."""
 
 
 def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b q"]:
