@@ -174,7 +174,9 @@ def test_two_names_never_share_a_file_of_grasps(tmp_path: Path, monkeypatch: pyt
         dataclasses.replace(grasps, score=torch.full((1,), float(len(view.object)))).save(view.file(shelf))
         return dataclasses.replace(view.score, executable=1)
 
-    def attempt(view: View, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
+    def attempt(
+        view: View, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int
+    ) -> ProtocolResult:
         return ProtocolResult(row, draw, True, Status.OK, force=float(load_grasps(view.file(shelf)).score))
 
     monkeypatch.setattr("torchgrasp.evaluation.run._plan", plan)
