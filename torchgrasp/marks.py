@@ -104,7 +104,7 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
 
 
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
-    """Raise `BadArgument` for a sparse, nested or meta tensor, or if it requires a gradient without `gradients`."""
+    """Raise `BadArgument` if a tensor is sparse, nested or meta, or needs a gradient while `gradients` is false."""
     if value.layout is not torch.strided or value.is_nested or value.is_meta:
         found = "no numbers (meta)" if value.is_meta else f"a layout of {value.layout}"
         raise BadArgument(name, found, "a dense tensor with numbers")

@@ -114,7 +114,7 @@ def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
 
 
 def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileError]:
-    """Yield errors for drives without effort, and for parked or coupled joints beyond their limits."""
+    """Yield errors for drives without effort or velocity, and for fixed or coupled joints beyond their limits."""
     for joint in urdf.movable:
         if not (joint.effort > 0 and joint.velocity > 0):
             found = f"joint {joint.name} of effort {joint.effort}, velocity {joint.velocity}"

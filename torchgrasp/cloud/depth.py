@@ -197,7 +197,7 @@ def _is_table(value: object) -> bool:
 
 
 def _read_intrinsics(value: object) -> tuple[Float[Tensor, "3 3"], list[float] | None, float | None]:
-    """Return the matrix of intrinsics [px], their [width, height], and metres of a count; or refuse them."""
+    """Return the intrinsic matrix [px], the image's [width, height], and metres per depth unit; refuse wrong ones."""
     value, stated, scale, window = _read_forms(value)
     k, allowed = _as_tensor("intrinsics", value), "(fx, fy, cx, cy), or a 3 x 3 matrix"
     k = k if k.is_complex() else k.double()

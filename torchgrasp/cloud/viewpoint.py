@@ -24,9 +24,9 @@ def guess_viewpoint(
 ) -> tuple[Float[Tensor, "3"], float]:
     """Return a camera position [m] that explains a view, and the angle [deg] within which the camera is likely.
 
-    The camera is placed 4 radii of the cloud away, in the direction above the support that fits the points best.
-    The origin is preferred if the view is in front of it and a camera can have been there. An angle of 180 degrees
-    means that the points hardly tell the direction.
+    Of all directions above the support, the one that explains the points best is taken; the camera is placed along it,
+    4 radii of the cloud away. The origin is returned instead if the points lie in front of it and a camera there can
+    have taken the view. An angle of 180 degrees means that the points hardly tell the direction.
 
     Args:
         points: points of a view [m], without outliers.
@@ -60,8 +60,8 @@ def guess_viewpoint(
 def can_see(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> bool:
     """Return whether a camera at a place [m] can have taken a view.
 
-    From there, points must not hide other points. Besides, the points must be as dense as the camera's pixels, or
-    hardly any other place may explain the points better, or the camera must look down on a support.
+    Seen from there, points must not hide other points. In addition, one of three conditions must hold: the points are
+    as dense as the camera's pixels; no other place explains the points much better; the camera looks down on a support.
     """
     rows = draw_rows(len(points), DRAWN).to(points.device)
     points, normals = points[rows], normals[rows]

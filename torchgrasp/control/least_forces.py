@@ -121,7 +121,10 @@ class _Barrier:
         self.push_0 = -(normals * self.carried.reshape(self.count, 3)).sum(-1)
 
     def place(self, forces: Float[Array, "f 3"], share: float = 1.0) -> Float[Array, " k"]:
-        """Return the coordinates z of given forces, after a `share` of the forces that carry the load is subtracted."""
+        """Return z, the coordinates of given forces in the basis of the internal forces.
+
+        Before that, `share` times the forces that carry the load is subtracted from the given forces.
+        """
         return self.basis.T @ (forces.ravel() - share * self.carried)
 
     def forces(self, z: Float[Array, "*g k"]) -> Float[Array, "*g f 3"]:

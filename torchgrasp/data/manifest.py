@@ -52,7 +52,7 @@ class ObjectEntry:
     mass: float | None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
-        """Return the sorted names of at most `most` views; with `whole` only the view `WHOLE`, from all sides."""
+        """Return at most `most` names of views, sorted; with `whole`, only `WHOLE`, the view that shows all sides."""
         return ([WHOLE] if whole else sorted(self.views))[:most]
 
 

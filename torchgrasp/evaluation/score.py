@@ -138,7 +138,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
 
 
 def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
-    """Return the success rates of some views, and their numbers of refusals and executable grasps, by name."""
+    """Return success rates over some views, the number of views without any grasp, and that of executable grasps."""
     draws = 1 + max((attempt.draw for score in scores for attempt in score.attempts), default=0)
     tried = [(score.unit, attempt) for score in scores for attempt in score.attempts]
     best = [(unit, attempt.passed) for unit, attempt in tried if attempt.rank == 0]
@@ -190,7 +190,9 @@ class Bin(NamedTuple):
 def judge(
     predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]
 ) -> dict[str, float | list[Bin]]:
-    """Return calibration measures of predicted probabilities, given the outcomes; `units` names each trial's family.
+    """Return calibration measures of predicted probabilities, given the outcomes.
+
+    Trials with the same name in `units` count as dependent in the bins' confidence intervals.
 
     "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect predictions and 0
     for always predicting the mean. "auc" is the area under the ROC curve. "error" is the expected calibration error

@@ -142,7 +142,10 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[None]:
-    """Lock a file against other runs within the context, by a lock file beside it; remove half-written copies."""
+    """Lock a file against other runs within the context, by a lock file beside it.
+
+    On entry, remove the half-written copies of the file that broken-off runs left.
+    """
     with _hold("path", path, path.with_name(f".{path.name}{LOCK}")):
         _remove_parts(x for x in path.parent.glob(f".*{ENDING}") if x.name.startswith(f".{path.name}."))
         yield

@@ -38,7 +38,9 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """The origin of a hand: its option or finger names, its URDF, the SHA-256 of both files, and all options.
+    """The origin of a hand: its option or finger names, its URDF, one SHA-256 of its files, and all its options.
+
+    The files are the URDF and the description, `hand.toml`.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("allegro").source.options

@@ -109,8 +109,9 @@ class FreeMotion(Value):
     actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling` maps a step of pose (six numbers) and
     actuated joints to the motions; None means the identity.
 
-    `product` maps all link frames to all markers in one matrix product, in groups of `sizes`. First come the given
-    markers, then each motion's origin, rotation axis and translation axis; one of the two axes is zero.
+    `product` maps all link frames to all markers in one matrix product. The markers come in groups of `sizes`: first
+    the given groups, then the origins of all motions, all rotation axes, and all translation axes. One of the two axes
+    of a motion is zero.
     """
 
     product: Float[Tensor, "m k"]

@@ -187,7 +187,11 @@ class CobylaRun:
         return self.last[1:]
 
     def clearances(self, frames: Float[Tensor, "3 4 l 1"], pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, ""]]:
-        """Return the least clearances [m]: between links; of palm, fingers, tips from object; from table, obstacles."""
+        """Return least clearances [m] of the hand from itself and from the world.
+
+        They are in this order: between the hand's own links; from the object to the palm, to each finger and to each
+        fingertip; from the table to the hand; from obstacles to the hand. Those that the world lacks are left out.
+        """
         spheres, radius = self.hand.collision_spheres, self.hand.collision_spheres.radius.to(pose)
         local = map_points(frames.index_select(2, spheres.link_index), spheres.center)[..., 0].T
         centres = apply(pose, local)

@@ -89,7 +89,8 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the frame of three to five points, with the origin at their centroid.
 
-    Its axes are those of the `virtual_frame` of three points: the points themselves, or their `triangle_of`.
+    Its axes are those of the `virtual_frame` of three points: the given ones, or for more than three points the corners
+    of the triangle that `triangle_of` returns.
     """
     return rigid(virtual_frame(triangle_of(points))[..., :3, :3], points.mean(-2))
 

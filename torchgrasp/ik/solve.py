@@ -70,12 +70,14 @@ def solve_ik(
 ) -> IKSolution:
     """Return hand configurations that touch given contacts, in any assignment to fingers, without self-collision.
 
+    All arguments are moved to the contacts' device.
+
     Args:
         contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not used.
-        mixture: the hand's learned model; without it, only the library gives initial guesses.
-        world: object, table and obstacles that the links must not touch; by default, only self-collision counts. All
-            arguments are moved to the contacts' device.
-        method: "cobyla" is the paper's method (Sec. 6.3): tips touch with their contact points, in any direction.
+        mixture: the hand's learned model; without it, all initial guesses come from `library`.
+        world: object, table and obstacles that the links must not touch; by default, only self-collision counts.
+        method: "cobyla" is the paper's method (Sec. 6.3), which brings each tip's contact point to its contact and
+            ignores the contact directions.
         library: the hand's random postures; by default they are drawn when they are needed.
 
     Returns:

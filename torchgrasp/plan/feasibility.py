@@ -75,7 +75,7 @@ class FlatnessConstraint(Batch):
     at: Vectors
 
     def values(self, points: Vectors) -> Float[Tensor, "b k"]:
-        """Return the constraint values at nearby points, by the linear model."""
+        """Return the constraint values at points near `at`, from the linear model; one row per contact set."""
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 

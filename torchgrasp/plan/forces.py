@@ -41,7 +41,7 @@ Slide = Float[Tensor, "b f 3 k"]
 
 
 def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
-    """Return the matrix from 3 f force components at `points` to total force and torque about the points' centroid."""
+    """Return the grasp matrix: from contact forces (3 f numbers) at f `points` to total force, and torque about the mean point."""
     arms = points - points.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
     return torch.cat([torch.cat([eye] * arms.shape[-2], -1), torch.cat(skew(arms).unbind(-3), -1)], -2)

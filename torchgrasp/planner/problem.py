@@ -181,7 +181,7 @@ class Problem:
 
     @property
     def spec(self) -> ContactSpec:
-        """The constraints on contacts for the fingertips of this hand, in the upright frame."""
+        """The constraints on the contacts of this hand's fingertips, in the upright frame (z points up)."""
         return self.flat.spec
 
     @cached_property
@@ -236,7 +236,7 @@ class Problem:
         return None if given is None else lambda poses: given(frame.to(poses) @ poses)
 
     def reach(self, contacts: Contacts, certificate: Certificate) -> GraspProblem:
-        """Return the inverse kinematics problem for contacts and their certificate of force closure."""
+        """Return the inverse kinematics problem of reaching contacts, with their certificate of force closure."""
         return GraspProblem(self.hand, contacts, certificate, self.world, self.center, self.reachable)
 
     def tell(self, stage: str, message: str, value: Any) -> None:

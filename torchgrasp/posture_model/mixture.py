@@ -164,7 +164,11 @@ class GraspMixture(GaussianMixture):
 
     @checked
     def joints(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b h"]:
-        """Return the expected joints [rad] given each code, Eq. (23); they may exceed the limits. NaN gives NaN."""
+        """Return the expected joint positions [rad] given each contact code, Eq. (23) of the paper.
+
+        The code describes a contact set by three lengths [m] and three cosines. The joints may exceed their limits. A code
+        with NaN gives NaN.
+        """
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
             # sum_i h_i A_i (q, 1) as one matrix product
@@ -178,8 +182,9 @@ class GraspMixture(GaussianMixture):
     def modes(
         self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
     ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
-        """Return mean joints [rad] and responsibilities (h_i, Eq. 23) of the k components most responsible for a code.
+        """Return mean joints [rad] and responsibilities of the k components most responsible for a contact code.
 
+        The responsibilities are h_i in Eq. (23) of the paper, the largest first.
         Use them where several postures have the same code: the expected joints may then be none of these postures.
         Raises `BadArgument` for k outside [1, m].
         """

@@ -127,7 +127,7 @@ def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Te
 
 
 def _run_lengths(text: bytes) -> list[int]:
-    """Return the run lengths in COCO's text of 5 bits a letter; after the third, the text holds differences."""
+    """Return run lengths from COCO's text, 5 bits a letter; from the fourth on, it holds run i minus run i - 2."""
     runs: list[int] = []
     value = shift = 0
     for letter in text:

@@ -131,7 +131,7 @@ def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
 
 
 def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h w"]:
-    """Return labels in which a floor that an object encloses above the table, as in a pan, has the object's label."""
+    """Return labels in which the inner floor of an object, such as a pan, has the label of that object."""
     from scipy.ndimage import binary_dilation, find_objects, label
 
     holes = np.empty(labels.shape, dtype=np.int32)

@@ -135,9 +135,9 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
 
 
 def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
-    """Return the mean distance on a cubic grid that starts at -radius on each axis; NaN outside the ball.
+    """Return the mean signed distance at the nodes of a cubic grid, which starts at -radius; NaN outside the ball.
 
-    Only blocks of cells that the zero level may cross are refined; other nodes copy the value of a neighbour.
+    Every node of a block is evaluated if the surface may cross the block; other nodes copy a node of a coarser grid.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 

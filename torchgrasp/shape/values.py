@@ -86,7 +86,10 @@ def off_surface(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: fl
 
 @dataclasses.dataclass(frozen=True)
 class MeanJet(Batch):
-    """The posterior mean distance and its derivatives by the normalised point; gradients need not have unit length."""
+    """The posterior mean of the signed distance at points, with its gradient and Hessian.
+
+    The derivatives are by normalised coordinates (centred and scaled). Gradients need not have unit length.
+    """
 
     distance: Float[Tensor, "*b"]
     gradient: Float[Tensor, "*b 3"]

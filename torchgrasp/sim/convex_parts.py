@@ -70,7 +70,7 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
 def read_solid(
     mesh: "trimesh.Trimesh | Path | str", parts: "Sequence[trimesh.Trimesh] | None"
 ) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Return a closed mesh and the convex parts that make it up: `parts`, or else parts computed here."""
+    """Read a closed mesh; return it and its convex parts: the given `parts`, or else a convex decomposition."""
     mesh = read_mesh(mesh)
     return mesh, convex_parts(mesh) if parts is None else check_parts(parts)
 

@@ -129,7 +129,7 @@ class SceneSpec:
 
     @property
     def body(self) -> Body:
-        """The object as a body."""
+        """The object to grasp as a rigid body: its mesh, convex parts and mass."""
         return Body(self.mesh, self.parts, self.mass)
 
     @property

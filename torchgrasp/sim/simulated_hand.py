@@ -117,7 +117,7 @@ class SimulatedHand:
         return max(1, round(seconds / self.period))
 
     def _observe(self, contacts: StepContacts) -> Observation:
-        """Return what the hand measures at the end of a tick, given the sums of the true contacts during the tick."""
+        """Return what the hand measures at the end of a tick, given the true contact forces summed over the tick."""
         world_from_hand = self.scene.hand_pose()
         rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
         tips = self.scene.tip_poses()

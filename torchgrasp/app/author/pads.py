@@ -102,7 +102,7 @@ def is_primitive(link: Link) -> bool:
 
 
 def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
-    """Return a pad on a ball inside the end of a finger; the ball touches the finger's surface at the pad."""
+    """Return a spherical pad at a finger's end: part of a ball that touches the finger's surface from inside."""
     axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
     local = points @ axes
     end = local[:, 1].max()

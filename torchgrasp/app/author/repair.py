@@ -265,7 +265,7 @@ def urdf_text(urdf: Urdf) -> str:
 
 
 def _add(above: ET.Element, tag: str, **attributes: str | float | Sequence[float]) -> ET.Element:
-    """Add an element with names, numbers or several numbers as attributes; negative zero becomes zero."""
+    """Add an XML element whose attributes are texts, numbers or lists of numbers; negative zero is written as zero."""
     element = ET.SubElement(above, tag)
     for key, value in attributes.items():
         element.set(

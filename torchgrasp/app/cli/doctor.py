@@ -35,8 +35,8 @@ class Finding(NamedTuple):
 class Doctor(Command):
     """List installed and missing packages, with the command that installs each.
 
-    The exit code is 1 if a simulator or a package is missing. Planning needs no simulator, and a package that only one
-    command needs may be missing.
+    The exit code is 1 if a simulator or a package is missing, even though planning needs no simulator. A missing Dask,
+    which only `campaign --scheduler` needs, does not change the exit code.
     """
 
     def run(self) -> int:

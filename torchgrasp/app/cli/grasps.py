@@ -61,9 +61,9 @@ class Grasp(Command):
     """Plan grasps of an object in a partial cloud or a scene; with a mesh, also close the hand in simulation.
 
     Writes grasps.safetensors, report.html and the 3D page view.html into the output folder. If no grasp is executable,
-    single changes are tried, and the change that helps most is named. The cloud is checked as by `cloud check`. It is
-    refused if the camera is below the table or contradicts the points, if a plane is left in, if there are two bodies,
-    or if the unit is wrong. Other findings are printed as advice.
+    one setting at a time is changed, and the change that helps most is named. The cloud is checked as by `cloud check`.
+    It is refused if the camera is below the table or contradicts the points, if the table or another plane was not
+    removed from it, if there are two bodies, or if the unit is wrong. Other findings are printed as advice.
     """
 
     cloud: Path = positional(

@@ -17,7 +17,10 @@ EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot fing
 
 
 class Solid(NamedTuple):
-    """A mesh of one collision shape with vertex normals, and the indices of its link and finger (or `PARKED`)."""
+    """A mesh of one collision shape with vertex normals, and the indices of its link and finger.
+
+    The finger is `PARKED` if the link belongs to no grasping finger, such as the palm, or to several.
+    """
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray

@@ -225,7 +225,7 @@ class Impedance:
         return self.reference.expand(posture + drift + self.lead + share * (lead - self.lead))
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """If the grasp is unstable, raise its forces, and bring its stiffness to that of stable grasps of its size."""
+        """If the grasp is unstable, raise its forces; move its stiffness to that of stable grasps as wide as it."""
         if self.stability is None or self.time < RAMP + 0.3:  # the filtered readings must have followed the forces
             return
         state = state_of(self.springs, lengths_of(observation.tips), self.reading)

@@ -30,7 +30,7 @@ class Ellipsoid:
 
     Args:
         points, normals: points [m] and normals spread over the whole ellipsoid.
-        deviations: errors [m] of each point along its normal, one column for each independent cause.
+        deviations: standard deviations [m] of each point along its normal, one column per independent source of error.
         misfit: RMS distance [m] of the cloud from the ellipsoid.
     """
 
@@ -99,7 +99,10 @@ class _Fit:
         return ((found[1:] - found[0]) / step[:, None]).T
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Return residuals of points, normals, outline, table and prior over their deviations, a row per ellipsoid."""
+        """Return residuals of points, normals, outline, table and prior, each divided by its deviation.
+
+        There is one row per ellipsoid.
+        """
         distance, normal = self.distance_and_normal(parameters)
         share, k = np.sqrt(len(self.points) / INDEPENDENT), len(parameters)
         shape = _symmetric(parameters[:, 3:])

@@ -243,7 +243,10 @@ def _across_plane(scorer: SymmetryScorer, planes: list[Mirror], grid: Float[Tens
 
 
 def _square_plane(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror, across: View) -> Mirrors:
-    """Return, as a row, the best vertical plane perpendicular to `best`, if its images can be hidden and it is new."""
+    """Return the best vertical plane at right angles to `best`, as a row.
+
+    There is no row if it is known already or if mirrored points would be visible.
+    """
     direction = torch.stack([-best[1], best[0], torch.zeros_like(best[0])])[None]
     near = any(abs(float(plane[:3] @ direction[0])) > 0.42 for plane in planes)
     if near or not bool(_hides(direction, across)):
