@@ -166,8 +166,8 @@ class GraspMixture(GaussianMixture):
     def joints(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b h"]:
         """Return the expected joint positions [rad] given each contact code, Eq. (23) of the paper.
 
-        The code describes a contact set by three lengths [m] and three cosines. The joints may exceed their limits. A code
-        with NaN gives NaN.
+        The code describes a contact set by three lengths [m] and three cosines. The joints may exceed their limits. A
+        code with NaN gives NaN.
         """
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
