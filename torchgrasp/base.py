@@ -73,7 +73,7 @@ class Value:
 
 
 def _short(value: Any) -> str:
-    """Return a short text for one field of a value."""
+    """Return a short text for one field's value: type and shape of a tensor, length of a long list, or the value."""
     if isinstance(value, Tensor):
         if value.numel() <= 4 and value.device.type == "cpu":
             return _digits(value.tolist())
@@ -85,7 +85,7 @@ def _short(value: Any) -> str:
 
 
 def _digits(value: Any) -> str:
-    """Return a number, or nested lists of numbers, as text with five digits."""
+    """Return a number, or nested lists of numbers, as text with five significant digits."""
     if isinstance(value, list):
         return f"[{', '.join(map(_digits, value))}]"
     return f"{value:.5g}" if isinstance(value, float) else str(value)

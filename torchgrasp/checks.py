@@ -242,7 +242,7 @@ def _always(kind: type) -> bool:
 
 @functools.cache
 def _fields(kind: type) -> dict[str, Any]:
-    """Return the annotations of a dataclass's fields by name."""
+    """Return the type annotation of each field of a dataclass, by name; empty for other types."""
     fields = dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ()
     return {field.name: _hints(kind)[field.name] for field in fields}
 
@@ -268,7 +268,7 @@ def _hints(thing: Any) -> dict[str, Any]:
 
 
 def _option(hint: Any, key: str) -> Any:
-    """Return the annotation of one keyword argument of `**options`."""
+    """Return the type annotation of the keyword argument `key` of `**options`."""
     return _hints(typing.get_args(hint)[0]).get(key, Any) if typing.get_origin(hint) is Unpack else hint
 
 

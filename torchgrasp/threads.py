@@ -50,7 +50,7 @@ def single_threaded(function: Function) -> Function:
 
 
 def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
-    """Yield the items of a generator, each computed with one torch thread."""
+    """Yield the items of a generator; each item is computed with torch set to one thread."""
     with contextlib.closing(items):
         while True:
             with one_thread():

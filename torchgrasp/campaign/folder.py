@@ -158,7 +158,7 @@ class _Store:
             remove_file(self._part(j))
 
     def _jobs(self, k: int) -> range:
-        """Return the indices of the jobs in shard k."""
+        """Return the indices of the jobs whose results are stored in shard k."""
         return range(k * self.size, min((k + 1) * self.size, len(self.campaign.rows)))
 
     def _part(self, j: int) -> Path:

@@ -48,7 +48,7 @@ class CampaignSpec(Value):
     jobs_in_shard: Annotated[int, Range(1, 10_000)] = 64
 
     def __post_init__(self) -> None:
-        """Check fields that depend on each other."""
+        """Raise `BadArgument` unless trials plan on partial views with default fingers, or for a bad licence."""
         trials = self.trials
         if trials.planned or trials.complete or trials.fingers is not None:
             found = next(name for name in ("planned", "complete", "fingers") if getattr(trials, name))

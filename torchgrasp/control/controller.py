@@ -87,7 +87,7 @@ class GraspController:
         self.targets = Targets(reference.expand(reference.pregrasp), left=approach)
 
     def _begin(self, closing: Closing) -> None:
-        """Start one attempt to close, with the given closing controller."""
+        """Start a new attempt to close the hand, controlled by `closing`, and count it."""
         self.closing, self.hold, self.check, self.reopening = closing, None, None, None
         self.time, self.pressed = 0.0, 0.0
         self.attempts += 1

@@ -125,7 +125,7 @@ class Localization:
 
     @property
     def done(self) -> bool:
-        """Whether all rotation angles were tried."""
+        """Whether the search for the object's pose has tried all rotation angles."""
         return self.step >= len(TURNS) + len(FINE_TURNS)
 
     @property

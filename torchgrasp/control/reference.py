@@ -139,7 +139,7 @@ class ClosingReference(Value):
 
     @functools.cached_property
     def _actuated(self) -> list[int]:
-        """Indices of the actuated joints among all joints of the URDF."""
+        """The index of each actuated joint in the list of all joints of the URDF."""
         return [self.hand.tree.joint_names.index(name) for name in self.hand.joint_names]
 
     @property

@@ -146,7 +146,7 @@ class FingertipSensor:
         self.alive = reference.alive
 
     def __call__(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"], period: float) -> TactileState:
-        """Return the readings one tick later.
+        """Return what the fingertip sensors report at the end of a control tick, delayed as the sensor is.
 
         Args:
             truth: true contacts during the tick.

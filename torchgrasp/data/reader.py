@@ -109,7 +109,7 @@ class GraspShards:
         return ShardJob(row[0], cloud, grasps, records.passed, records.outcome)
 
     def _read(self, k: int) -> Shard:
-        """Read shard k, and check that its rows are those in `card.json`."""
+        """Read shard k (a file of results); raise an error if its jobs are not those listed in `card.json`."""
         path = shard_path(self.folder, k)
         shard = load_shard(path, {"campaign": str(self.card["campaign"])})
         bare = tuple(row._replace(meta={}) for row in shard.rows)

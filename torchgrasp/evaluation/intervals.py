@@ -38,7 +38,7 @@ def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]
 
 
 def _sum_by(values: Iterable[tuple[str, int | float]]) -> dict[str, tuple[int | float, int]]:
-    """Return sum and number of the values for each unit."""
+    """Return the sum and the number of values by unit name, given pairs of unit name and value."""
     sums: dict[str, tuple[int | float, int]] = {}
     for name, value in values:
         before = sums.get(name, (0, 0))

@@ -215,7 +215,7 @@ class _Lift:
             raise _ObjectLost
 
     def _moved(self) -> float:
-        """Return the distance [m] of the object's centre of mass from its start."""
+        """Return the distance [m] between the centres of mass of the object now and at the start of the trial."""
         return float(torch.linalg.vector_norm(self.ticks[-1].centre - self.ticks[0].centre))
 
     def _all_touched(self) -> bool:
@@ -223,7 +223,7 @@ class _Lift:
         return self.run.controller.hold is not None or bool(np.isfinite(self.run.robot.first_touch).all())
 
     def _verdict(self) -> Status:
-        """Return the status of a completed trial: held, or the first failure."""
+        """Return the status of a completed trial: `Status.OK` if the object was held, or else the first failure."""
         judged_time = 0.2  # time [s] at the end of a trial in which contacts are counted
         half = 0.5 * self.spec.lift_height
         rise = [float(tick.centre[2] - self.ticks[0].centre[2]) for tick in self.ticks]

@@ -155,7 +155,7 @@ def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
 
 
 def _judge_predictions(scores: Sequence[ViewScore]) -> dict[str, Any] | None:
-    """Return the calibration of predicted success, or None without predictions."""
+    """Return how well predicted success agrees with the outcomes of trials; None if no attempt has a prediction."""
     known = [(score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)]
     if not known:
         return None
@@ -164,7 +164,7 @@ def _judge_predictions(scores: Sequence[ViewScore]) -> dict[str, Any] | None:
 
 
 def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
-    """Return the median and the 95 % quantile of the values that are not NaN, or None."""
+    """Return the median and the 95 % quantile of the values that are not NaN; None if there are none."""
     known = torch.tensor([value for value in values if not math.isnan(value)], dtype=torch.float64)
     if not len(known):
         return None
@@ -173,7 +173,7 @@ def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
 
 
 def _mean(values: Iterable[float]) -> float | None:
-    """Return the mean of the values that are not NaN, or None."""
+    """Return the mean of the values that are not NaN; None if there are none."""
     known = [value for value in values if not math.isnan(value)]
     return sum(known) / len(known) if known else None
 
@@ -213,7 +213,7 @@ def judge(
 
 
 def _bins(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]) -> list[Bin]:
-    """Return those of ten calibration bins of equal width that hold a prediction."""
+    """Return calibration bins of width 0.1 of the predicted probability, without the empty ones."""
     at, bins = (predicted * 10).long().clamp(0, 9), []
     for k in at.unique().tolist():
         rows: list[int] = torch.nonzero(at == k)[:, 0].tolist()

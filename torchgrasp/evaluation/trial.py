@@ -231,7 +231,7 @@ def _to_world(grasp: Grasps, obj_from_world: Float[Tensor, "4 4"]) -> Grasps:
 
 
 def _rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round numbers of about size 1 to a billionth."""
+    """Round numbers of about size 1 to multiples of a billionth."""
     return torch.round(numbers / GRID**1.5) * GRID**1.5
 
 

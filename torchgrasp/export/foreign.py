@@ -89,7 +89,7 @@ def read_foreign(
 
 
 def _refuse(found: str, allowed: str) -> ModelFileError:
-    """Return the error for a bad file of grasps."""
+    """Return the error to raise for a bad file of grasps: what was found, and what is allowed."""
     return ModelFileError("path", found, allowed)
 
 
@@ -114,7 +114,7 @@ def _table(field: Field, width: int) -> np.ndarray:
 
 
 def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion) -> ForeignGrasps:
-    """Read an .npz in DexGraspBench's format, with one grasp or rows of grasps."""
+    """Read an .npz file in DexGraspBench's format; the file holds one grasp, or one row for each of several grasps."""
     bench_from_root, known = bench_frame(hand)
     order = order or known
     places, width = _places(hand, order), 7 + len(order)

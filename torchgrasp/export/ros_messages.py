@@ -93,7 +93,7 @@ def format_trajectories(
 
 
 def _trajectories(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> Iterator[dict[str, Any]]:
-    """Yield a trajectory_msgs/JointTrajectory of each grasp, with every joint of the hand."""
+    """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dict, with all joints of the hand."""
     squeezed, postures = named_postures(hand, grasps, force, kp)
     names, root = list(hand.tree.joint_names), read_urdf(hand.urdf_path).root
     for row in range(len(grasps)):
@@ -118,7 +118,7 @@ def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
 
 
 def _translation(direction: Float[Tensor, "3"]) -> dict[str, Any]:
-    """Return a moveit_msgs/GripperTranslation along a direction, as long as the approach."""
+    """Return a moveit_msgs/GripperTranslation along `direction`, as a dict; its distance is that of the approach."""
     vector = dict(zip("xyz", direction.tolist(), strict=True))
     stamped = {"header": {"frame_id": OBJECT_FRAME}, "vector": vector}
     return {"direction": stamped, "desired_distance": APPROACH_DISTANCE, "min_distance": APPROACH_DISTANCE}

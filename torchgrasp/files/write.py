@@ -105,7 +105,7 @@ def format_json(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Replace statuses by their names, and NaN and infinity by None, for JSON."""
+    """Return a value fit for JSON: a status becomes its name, and NaN and infinity become None."""
     if isinstance(value, dict):
         return {key: _plain(x) for key, x in value.items()}
     if isinstance(value, list | tuple):

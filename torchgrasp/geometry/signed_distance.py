@@ -37,7 +37,7 @@ class SignedDistanceField(Value):
 
     @cached_property
     def _last_node(self) -> Int[Tensor, "3"]:
-        """Index of the last node along each axis."""
+        """The index of the last grid node along each of the three axes."""
         return torch.tensor(self.values.shape, device=self.values.device) - 1
 
     @checked(gradients=True)

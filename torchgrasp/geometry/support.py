@@ -245,7 +245,7 @@ class _Candidate:
 
 
 def _ordered(found: list[_Candidate]) -> list[_Candidate]:
-    """Return the candidates, the most plausible first."""
+    """Return the candidate supports ordered by score, with the highest wide support parallel to the best one first."""
     first = max(found, key=lambda candidate: candidate.score)
     furniture = [candidate for candidate in found if candidate.support.width > FURNITURE and candidate.parallel(first)]
     higher = [candidate for candidate in furniture if float(first.support.plane.height(candidate.middle)) > 0]
@@ -292,7 +292,7 @@ def _judge(view: View, fit: PlaneFit, least_width: float) -> _Candidate | str:
 
 
 def _looked_at(view: View, fit: PlaneFit, support: Support) -> bool:
-    """Return whether the middle of the view meets the region of a support."""
+    """Return whether the middle of the view points at the region of a support; True if no camera is known."""
     if view.eye is None:
         return True
     ahead = unit(view.points - view.eye).mean(0)

@@ -125,22 +125,22 @@ class SelfCollision(Value):
         return shapes, apart, pair, row
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
-        """Return the distance between the two centres of each pair."""
+        """Return the distance [m] between the centres of the two shapes of each pair."""
         first, second = self.pairs.unbind(1)
         return _length(center.index_select(1, second) - center.index_select(1, first))
 
     @cached_property
     def _links(self) -> int:
-        """The least number of link frames that place every shape."""
+        """The number of link frames to pass, so that every link with a collision shape is among them."""
         return int(self.link.max()) + 1 if len(self.link) else 0
 
     @cached_property
     def _bounding(self) -> Float[Tensor, " s"]:
-        """The radii of the shapes' bounding spheres."""
+        """The radius [m] of the bounding sphere of each collision shape."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
 
     def _sums(self, radius: Float[Tensor, " s"], like: Tensor) -> Float[Tensor, "p 1"]:
-        """Return the sum of the two radii of each pair."""
+        """Return for each pair of shapes the sum of their radii, given the `radius` of every shape."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
     def _split(self, pair: Int[Tensor, " k"]) -> Iterator[tuple[int, slice]]:
@@ -152,7 +152,7 @@ class SelfCollision(Value):
                 yield kind, slice(low, high)
 
     def _separations(self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
-        """Return the separations [m] of the sorted pairs `pair` in the postures `row`."""
+        """Return separations [m] of pairs of shapes; entry i is of pair `pair[i]` in posture `row[i]`."""
         parts = [self._of_kind(kind, shapes, pair[at], row[at])[0] for kind, at in self._split(pair)]
         return torch.cat(parts) if parts else shapes[1].new_zeros(0)
 
@@ -200,12 +200,12 @@ class SelfCollision(Value):
 
 
 def _inside(axes: Float[Tensor, "3 3 k"], v: Float[Tensor, "3 k"]) -> Float[Tensor, "3 k"]:
-    """Return the components of vectors along the columns of `axes`."""
+    """Return the components of vectors along the unit vectors in the columns of `axes`."""
     return (axes * v[:, None]).sum(0)
 
 
 def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
-    """Return the length of vectors; its derivative at 0 is 0."""
+    """Return the lengths of vectors; the derivative of the length of a zero vector is 0."""
     squared = torch.addcmul(torch.addcmul(v[0] * v[0], v[1], v[1]), v[2], v[2])
     return torch.sqrt(squared.clamp_min(1e-24))
 

@@ -113,14 +113,14 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> floa
 
 
 def _closing(hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"]) -> Float[Tensor, "g k s 3"]:
-    """Return the sphere centres [m] at k postures from pre-grasp to grasp."""
+    """Return the centres [m] of the collision spheres at k postures, in equal steps from pre-grasp to grasp."""
     shares = torch.linspace(0, 1, 6).tolist()
     postures = [torch.lerp(pregrasp, configuration.joints, share) for share in shares]
     return torch.stack([_centres(hand, Configuration(x, configuration.obj_from_hand)) for x in postures], 1)
 
 
 def _lift(hand: Hand, configuration: Configuration, up: Float[Tensor, "3"]) -> Float[Tensor, "g k s 3"]:
-    """Return the sphere centres [m] at k heights while the hand is lifted."""
+    """Return the centres [m] of the collision spheres at k heights while the hand is lifted along `up`."""
     return _lifted(_centres(hand, configuration), up).movedim(0, 1)
 
 

@@ -74,7 +74,7 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
 
 
 def _take(vectors: Float[Tensor, "b f k 3"], index: Int[Tensor, "b f 1"]) -> Vectors:
-    """Return one of k vectors at each contact, given its index."""
+    """Return the vector with the given index among the k vectors at each contact."""
     return vectors.gather(2, index[..., None].expand(-1, -1, 1, 3))[:, :, 0]
 
 
@@ -239,7 +239,7 @@ def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: 
 
 
 def _balances(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Bool[Tensor, "b"]:
-    """Return whether coefficients phi are positive and balance the wrenches."""
+    """Return for each contact set whether the coefficients `phi` are positive and sum its wrenches to zero."""
     return ((phi[:, None] @ wrench)[:, 0].abs().amax(-1) <= BALANCED) & (phi.amin(-1) > BALANCED)
 
 

@@ -95,7 +95,7 @@ def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: 
 
 
 def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
-    """Return the result of `flatness_constraint` for contacts on one surface."""
+    """Return the linear flatness constraint for contacts on one surface of the shape, such as a vessel's outer wall."""
     jet, radius = triple_mean_jet(shape, points), radius / float(shape.scale)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)

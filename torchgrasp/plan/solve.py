@@ -70,7 +70,7 @@ def plan_contacts(
 
 
 def _stages(spec: ContactSpec) -> tuple[Stage, ...]:
-    """Return the solver stages for random initial guesses."""
+    """Return the solver stages for random initial guesses; they depend on whether contacts must be flat."""
     return SEARCH if spec.flatness is None else TO_CENTRE
 
 

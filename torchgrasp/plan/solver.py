@@ -164,7 +164,7 @@ def start_state(shape: Shape, points: Vectors) -> State:
 def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
     """Return equal tensions for all pairs of contacts; the force at each contact then points to the centroid.
 
-    A tension is a force per metre of distance between the two contacts of a pair.
+    A pair of contacts pulls together with its tension times its distance.
     """
     pairs = contact_pairs(points.shape[1], points.device).shape[1]
     return normalise_tensions(points, points.new_ones(len(points), pairs))

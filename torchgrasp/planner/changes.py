@@ -33,7 +33,7 @@ class Change:
 
 
 def _with(request: Request, **fields: Any) -> Request:
-    """Return the request with some fields of its constraints on contacts (`ContactSpec`) changed."""
+    """Return the request with the given fields of its contact constraints (`ContactSpec`) replaced."""
     return dataclasses.replace(request, spec=dataclasses.replace(request.contact_spec, **fields))
 
 

@@ -98,7 +98,7 @@ class Funnel(Value):
 
 
 def _failures(status: Int[Tensor, "b"]) -> dict[Status, int]:
-    """Return how often each status other than OK occurs, the most frequent first."""
+    """Return how often each status but OK occurs in `status`, as a dict with the most frequent first."""
     return {name: n for name, n in count_status(status).items() if name is not Status.OK}
 
 

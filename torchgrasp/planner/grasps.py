@@ -158,7 +158,7 @@ def _plan(request: Request) -> Grasps:
 
 
 def _stream(request: Request) -> Iterator[Grasps]:
-    """Yield the executable grasps of each batch that has any, best first."""
+    """Plan in batches; yield the executable grasps of each batch that has any, the best grasp first."""
     batches = list[Grasps]()
     for grasps in _plan_batches(request):
         batches.append(grasps)
@@ -255,7 +255,7 @@ def _plan_or_refuse(request: Request) -> Grasps:
 
 
 def _refused(hand: Hand, reason: str) -> Grasps:
-    """Return an empty set of grasps, with the reason in `meta`."""
+    """Return an empty set of grasps, whose `meta` gives the reason why planning was refused."""
     return dataclasses.replace(no_grasps(hand), meta={"hand": hand.name, "refused": reason})
 
 

@@ -49,7 +49,7 @@ class Shard:
         return x
 
     def count(self) -> int:
-        """Count the rows of all processes."""
+        """Return the number of samples (rows) in all processes together."""
         return int(self.sum(self.rows.new_tensor(len(self.rows), dtype=torch.int64)))
 
 

@@ -55,7 +55,7 @@ class Checkpoint:
         return progress
 
     def _read(self, path: Path) -> Progress:
-        """Read the file and check that it belongs to this fit."""
+        """Read the progress of an EM fit from a checkpoint; raise an error if it is not of this fit."""
         m, d = int(self.settings["components"]), len(self.centre)
         shapes = {"weights": (m,), "means": (m, d), "covariances": (m, d, d), "reseeded": (m,)}
         shapes |= {"log_likelihood": (-1,), "centre": (d,), "scale": (d,)}

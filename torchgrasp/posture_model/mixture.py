@@ -100,7 +100,7 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
 
 
 def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
-    """Return the codes (Eqs. 15-18) of three fixed postures, which identify the hand."""
+    """Return the contact codes of three fixed postures, Eqs. (15)-(18) of the paper; they identify the hand."""
     lower, upper = hand.lower.double(), hand.upper.double()
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
     index = (torch.arange(hand.dof)[None] + torch.arange(3)[:, None]) % 3
@@ -138,7 +138,7 @@ class GraspMixture(GaussianMixture):
 
     @functools.cached_property
     def _code(self) -> GaussianMixture:
-        """The marginal mixture of the contact code, Eq. (22)."""
+        """The mixture over the contact code alone, without the joints, Eq. (22) of the paper."""
         return self.marginal(CODE_NAMES)
 
     @functools.cached_property

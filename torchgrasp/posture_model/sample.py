@@ -179,7 +179,7 @@ def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h
 def _draw_blocks(
     hand: Hand, generator: np.random.Generator, sampling: Sampling
 ) -> Iterator[tuple[Float[Tensor, "n h"], Float[Tensor, "n q"]]]:
-    """Yield blocks of suitable random postures (joints [rad], codes) without end."""
+    """Yield blocks of random postures without self-collision, without end: joints [rad] and contact codes."""
     lower, upper = hand.lower.double(), hand.upper.double()
     while True:
         uniform = torch.from_numpy(generator.random((BLOCK_POSTURES, hand.dof))).to(lower.device)

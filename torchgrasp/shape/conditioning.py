@@ -138,7 +138,7 @@ def select_points(
 
 
 def _score(criterion: Criterion, variance: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Return how informative each candidate is; a higher score is more informative."""
+    """Return a score of each candidate point: the higher, the more an observation of the point would tell."""
     if criterion == "variance":
         return variance
     if criterion == "error":

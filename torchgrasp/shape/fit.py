@@ -231,7 +231,7 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
 
 
 def _warn(kind: type[Warning], sentence: str) -> None:
-    """Show a warning with the line of the caller outside the library."""
+    """Show a warning that names the line of the user's code that called the library."""
     frames: list[FrameType] = [frame := sys._getframe()]
     while (frame := frame.f_back) is not None:
         frames.append(frame)

@@ -55,7 +55,7 @@ class HollowShape(ShapeGP):
 
     @property
     def walls(self) -> tuple[ShapeGP, ...]:
-        """The outer and the inner surface."""
+        """The outer and the inner surface of the hollow object."""
         return self.outer, self.inner
 
     @checked(gradients=True)

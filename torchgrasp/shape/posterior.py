@@ -178,7 +178,7 @@ class Posterior(Value):
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
     def _split_weights(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "near 3"]]:
-        """Return the weights of the observed distances, and of the observed normals."""
+        """Return the posterior weight of each observed distance and the three weights of each observed normal."""
         n = len(self.x)
         return self.weights[:n], self.weights[n:].reshape(3, self.n_oriented).T
 

@@ -193,7 +193,7 @@ def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: 
 
 
 def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
-    """Return normalised observations of a wall's hidden points, and their correlated errors."""
+    """Return observations of points on a hidden wall, in normalised units, and their correlated errors."""
     errors = correlated_errors(wall.points, wall.shared, FORM_ERROR)
     return observe(frame, wall.points, wall.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE), errors / frame.scale
 

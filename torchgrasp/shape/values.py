@@ -156,7 +156,7 @@ def pass_gradients(x: Float[Tensor, "*b 3"], evaluate: Evaluate, differentiate: 
 
 
 class _Known(torch.autograd.Function):
-    """An autograd function whose derivatives by the points are given."""
+    """An autograd function whose derivatives by the points are given by a function, not found by autograd."""
 
     @staticmethod
     def forward(x: Tensor, evaluate: Any, differentiate: Any) -> tuple[Tensor, ...]:
@@ -181,7 +181,7 @@ class _Known(torch.autograd.Function):
 
 
 class _Final(torch.autograd.Function):
-    """An autograd function for a gradient that cannot be differentiated again."""
+    """An autograd function that returns a gradient and raises an error if the gradient is differentiated again."""
 
     generate_vmap_rule = True
 

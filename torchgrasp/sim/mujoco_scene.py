@@ -72,7 +72,7 @@ class MujocoScene(Scene):
         self._mujoco.mj_step1(self.model, self.data)
 
     def _read(self, k: int) -> list[ContactPoint]:
-        """Return a list with the contact point number k of MuJoCo's present contacts."""
+        """Return MuJoCo's contact point number k with its impulse and force, as a list of one."""
         wrench, found = np.zeros(6), self.data.contact
         self._mujoco.mj_contactForce(self.model, self.data, k, wrench)
         axes = found.frame[k].reshape(3, 3)  # in rows; the first points from the first body to the second

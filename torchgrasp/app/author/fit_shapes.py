@@ -131,7 +131,7 @@ def _primitive_points(shape: Shape) -> Points:
 
 
 def _sample(mesh: "trimesh.Trimesh") -> Points:
-    """Return random points on a mesh, and its vertices."""
+    """Return points on a mesh: random points of its surface, then some of its vertices."""
     count = 4000  # points on each shape
     from trimesh.sample import sample_surface
 
@@ -170,7 +170,7 @@ def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
 
 
 def _boxes(corners: list[Corners], axes: np.ndarray) -> list[Shape]:
-    """Return boxes as shapes, from their lower and upper corners along `axes` (columns)."""
+    """Return collision boxes, given their lower and upper corners along the columns of `axes`."""
     return [_shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners]
 
 
@@ -208,7 +208,7 @@ def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[flo
 
 
 def _shape(kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray) -> Shape:
-    """Return a shape with numbers rounded to 1e-6."""
+    """Return a collision shape of a kind, size, rotation and centre; all numbers are rounded to 1e-6."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, center
     xyz, rpy = place(pose)

@@ -30,7 +30,7 @@ INTRINSICS_HELP = (
 
 @arguments(points="depth", path="out")
 class _DepthCommand(Command):
-    """The arguments of commands that read a depth image."""
+    """A command that reads a depth image; these are its arguments."""
 
     depth: Path = positional(DEPTH_HELP)
     intrinsics: tuple[str, ...] = required(INTRINSICS_HELP)
@@ -137,7 +137,7 @@ class CloudScene(_DepthCommand):
         return 0
 
     def _of_image(self) -> Scene:
-        """Read the depth image of the command and return its scene."""
+        """Return the scene that the command's depth image shows."""
         if self.viewpoint is not None or self.unit != "m":
             raise BadArgument("--intrinsics", "--viewpoint or --unit beside it", "--camera-pose or --depth-unit")
         depth, camera, mask, pose = self.images()
@@ -147,7 +147,7 @@ class CloudScene(_DepthCommand):
         return Scene.from_depth(depth, camera, pose, **given, up=self.vertical)
 
     def _of_cloud(self) -> Scene:
-        """Read the cloud of the command and return its scene."""
+        """Return the scene that the command's point cloud shows."""
         if self.depth.suffix.lower() in (".png", ".tif", ".tiff", ".exr") or is_scene(self.depth):
             raise BadArgument("--intrinsics", "none", "fx fy cx cy of the depth image, or a file")
         for name, given in (("mask", self.mask), ("frames", self.frames), ("depth-unit", self.depth_unit)):

@@ -128,7 +128,7 @@ def _rim(labels: np.ndarray, width: int) -> Bool[np.ndarray, "h w"]:
 
 
 def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> None:
-    """Write the label of each object at its widest place in the picture."""
+    """Write the label of each object into the picture, at the object's widest place."""
     from PIL import Image, ImageDraw, ImageFont
     from scipy.ndimage import distance_transform_edt
 

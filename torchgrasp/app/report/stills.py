@@ -153,7 +153,7 @@ def facing(grasp: Grasps) -> Direction:
 
 
 def rotated(direction: Direction, degrees: float) -> Direction:
-    """Return a direction rotated about z."""
+    """Return a direction, rotated by an angle [degrees] about the z axis."""
     x, y, z = direction
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     return (float(c * x - s * y), float(s * x + c * y), z)
@@ -202,5 +202,5 @@ def _label_colors(labels: np.ndarray) -> Float[np.ndarray, "*b 3"]:
 
 
 def _thinned(rows: np.ndarray, most: int) -> np.ndarray:
-    """Return every k-th row, at most `most` rows."""
+    """Return every k-th row, with the least k that leaves at most `most` rows."""
     return rows[:: -(-len(rows) // most)]

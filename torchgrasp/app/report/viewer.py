@@ -121,19 +121,19 @@ def describe(run: Run) -> dict[str, Any]:
 
 
 def _eye(direction: Direction) -> list[float]:
-    """Return the unit direction towards the initial camera, which looks from above."""
+    """Return the unit direction from the object to the initial camera: `direction`, raised to look from above."""
     x, y, z = direction
     eye = np.array([x, y, max(z, 0.35 * float(np.hypot(x, y)))])
     return (eye / np.linalg.norm(eye)).tolist()
 
 
 def _points(points: Float[Tensor, "n 3"]) -> dict[str, object]:
-    """Return at most 10,000 points of a cloud, encoded by `pack`."""
+    """Return a cloud as a JSON object made by `pack`, thinned to at most 10,000 points."""
     return pack(to_array(points)[thin_rows(len(points), 10_000)])
 
 
 def _surface(run: Run) -> dict[str, object]:
-    """Return the estimated surface with standard deviations and colours, encoded by `pack`."""
+    """Return the estimated surface with standard deviations and colours, as a dict of arrays made by `pack`."""
     surface, std_m = run.surface, to_array(run.surface.std_m)
     kept, faces = thin_mesh(to_array(surface.vertices), surface.faces.cpu().numpy(), MOST_FACES)
     most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6

@@ -251,6 +251,6 @@ class Impedance:
         return self.frame
 
     def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
-        """Return the actuated joints [rad] that best fit all joints, weighted by stiffness."""
+        """Return the actuated joints [rad] that best explain given positions of all joints, weighted by stiffness."""
         weighted = self.coupling * self.reference.kp[:, None]
         return weighted.T @ (joints - self.reference.hand.actuated.offset) / self.stiffness

@@ -111,7 +111,7 @@ class StabilityModel(Value):
 
     @functools.cached_property
     def _without_lengths(self) -> tuple[GaussianMixture, GaussianMixture]:
-        """The two mixtures, marginalised over the distances between fingertips."""
+        """The models of stable and of other grasps over stiffness and forces, without fingertip distances."""
         return self.stable.marginal((*STIFFNESS, *FORCES)), self.others.marginal((*STIFFNESS, *FORCES))
 
     @checked

@@ -92,7 +92,7 @@ class _Lines(NamedTuple):
 
 
 def _lines_from_above(points: Points, normals: Points) -> _Lines:
-    """Return the lines along the normals of points, seen from above."""
+    """Return the lines through points along their normals, projected onto the horizontal plane."""
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     steep = slope > STEEP
     level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)

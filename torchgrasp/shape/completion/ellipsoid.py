@@ -132,7 +132,7 @@ class _Fit:
 
 
 def _length(vectors: np.ndarray) -> np.ndarray:
-    """Return the lengths of vectors (..., 3), as (..., 1)."""
+    """Return the length of each vector along the last axis, which keeps size 1."""
     return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
 
 

@@ -195,7 +195,7 @@ def planes_near(
 
 
 def _level_directions(n: int) -> Float[Tensor, "n 3"]:
-    """Return n horizontal unit vectors over half a circle."""
+    """Return n horizontal unit vectors, evenly spaced over half a circle."""
     angle = torch.arange(n, dtype=torch.float64) * math.pi / n
     return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
 

@@ -142,7 +142,7 @@ def lid(vessel: Vessel) -> HiddenWall:
 
 
 def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
-    """Return the points on the opposite side of a wall, one thickness away."""
+    """Return the points and normals of the opposite face of a vessel's wall, one wall thickness away."""
     shared = wall.shared.clone()
     shared[:, 2] += THICKNESS_ERROR
     return HiddenWall(wall.points - vessel.thickness * wall.normals, -wall.normals, shared)
