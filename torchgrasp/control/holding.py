@@ -251,6 +251,6 @@ class GripHold:
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:
-    """Return the sensed contact normals, or the given normals where a fingertip senses none."""
+    """Return the contact normals that the fingertips sense, or the given normals where a fingertip senses none."""
     sensed = observation.tactile.normals.numpy()
     return np.where(np.isfinite(sensed).all(-1, keepdims=True), sensed, normals)

@@ -64,7 +64,7 @@ class ContactPlanes:
 
 
 def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
-    """Return the prior's inverse covariance: the object moves mostly along the table and turns about its normal."""
+    """Return the inverse covariance of the object's displacement before any touch: mostly along the table."""
     shift_std, height_std, turn_std, tilt_std = 0.01, 0.001, 0.09, 0.01  # [m, m, rad, rad]
     eye = torch.eye(3, dtype=reference.normals.dtype)
     place, turn = eye / shift_std**2, eye / turn_std**2

@@ -112,7 +112,7 @@ def field_from_surface(
 
 
 def _keep(known: np.ndarray) -> np.ndarray:
-    """Return the mask of known nodes on a grid twice as fine, from the mask `known` on the coarse grid."""
+    """Return the mask on a grid twice as fine of the nodes that are known from the coarse grid."""
     fine = np.zeros([2 * count - 1 for count in known.shape], dtype=bool)
     fine[::2, ::2, ::2] = known
     return fine
@@ -181,7 +181,7 @@ class _Surface:
 
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
-    """Return the pseudonormals (Baerentzen and Aanaes, 2005) of face, 3 sides, 3 corners of triangles, (f, 7, 3)."""
+    """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3 corners, (f, 7, 3)."""
     from trimesh.grouping import unique_rows
 
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -175,7 +175,7 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
 
 
 def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int) -> None:
-    """Raise `HandFileError` if `ahead` more postures, like those of `frames`, need over `most` exact separations."""
+    """Raise `HandFileError` if `ahead` postures like those of `frames` need over `most` measured separations."""
     left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
     if left > most:
         found = f"{len(shapes.pairs)} pairs of shapes so near each other that {left} separations must be measured"

@@ -262,5 +262,5 @@ class Hand(Value):
 
 
 def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
-    """Return a tensor, whose last axis counts postures, with reversed axes and the batch shape of `joints` first."""
+    """Return a tensor with reversed axes, so that postures come first, in the batch shape of `joints`."""
     return columns.permute(*range(columns.ndim - 1, -1, -1)).reshape(*joints.shape[:-1], *columns.shape[-2::-1])

@@ -221,7 +221,7 @@ def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
 
 
 def _tables(joint: Joint | None) -> Float[Tensor, "4 3 4"]:
-    """Return the tables constant, sine, cosine and slide of a joint's pose in its parent; None stands for the root."""
+    """Return four 3 x 4 tables: a joint's pose in its parent is their sum, weighted by 1, sin q, cos q and q."""
     tables = torch.zeros(4, 3, 4, dtype=torch.float64)
     constant, sine, cosine, slide = tables
     if joint is None:

@@ -167,7 +167,7 @@ def nearest_postures(
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
 ) -> tuple[Float[Tensor, "r p 4 4"], Float[Tensor, "r p d"]]:
-    """Return frame and features of r contact sets for each of p assignments to fingers; arbitrary if not `framed`."""
+    """Return frame and features of r contact sets for p assignments to fingers, valid where `framed` is true."""
     stand_in = torch.eye(3, dtype=centres.dtype, device=centres.device)
     triangle = torch.where(framed[..., None, None], triangle_of(centres), stand_in)
     obj_from_vf = rigid(virtual_frame(triangle)[..., :3, :3], centres.mean(-2))

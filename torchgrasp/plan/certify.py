@@ -73,7 +73,10 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
 
 def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
-    """Return margin, residual max |W phi| and witness of m wrenches, by the simplex method, or by HiGHS if it fails."""
+    """Return for m wrenches the margin of force closure, the residual force or torque, and a witness wrench.
+
+    The witness proves that no margin is greater.
+    """
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
     margin, upper = phi.amin(-1), bound_margin(wrench, witness)

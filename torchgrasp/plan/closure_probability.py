@@ -97,7 +97,7 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
 
 
 def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
-    """Return a mask of the covariance entries of two contacts on one wall of a vessel; `own` marks its contacts."""
+    """Return a mask of the covariance entries of two contacts on the same wall; `own` marks the wall's contacts."""
     own = own.repeat_interleave(4 * len(NODES), 1)
     return own[:, :, None] & own[:, None]
 
@@ -105,7 +105,7 @@ def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
 def _along_lines(
     shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]]:
-    """Return for one wall: deviation at contacts, mean distance on the grid, mean gradient and covariance at nodes."""
+    """Return, on lines along the normals: standard deviations, mean distances, mean gradients and covariances."""
     jet = shape.jet(points.flatten(0, 1))
     deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)

@@ -143,7 +143,7 @@ def _search_forces(
 
 @functools.cache
 def _search_steps() -> tuple[Float[Tensor, "3 s"], ...]:
-    """Return for each round of the search the changes of the three pushes that it tries: ever shorter steps."""
+    """Return for each round of a search the changes of the three normal forces that it tries, ever smaller."""
     with torch.device("cpu"):  # whatever the default device is
         first, near = (fibonacci_sphere(n, GOLDEN_ANGLE, 0.0) for n in (DIRECTIONS, NEIGHBOURS))
         around = torch.cat([near.new_zeros(1, 3), near]).T

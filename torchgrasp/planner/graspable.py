@@ -84,7 +84,7 @@ def _is_cut(pixels: Tensor, shape: tuple[int, ...]) -> bool:
 
 
 def _is_see_through(pixels: Tensor, depth: Float[Tensor, "h w"]) -> bool:
-    """Return whether most of an object lacks depth: more pixels without depth lie between its pixels than it has."""
+    """Return whether an object mostly lacks depth, as glass does: more gaps than pixels lie within its outline."""
     own, box = np.zeros(depth.shape, dtype=bool), tuple(slice(int(x.min()), int(x.max()) + 1) for x in pixels.T)
     own[tuple(pixels.T.numpy())] = True
     part, reach = own[box], np.logical_or.accumulate

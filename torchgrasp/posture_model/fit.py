@@ -175,7 +175,7 @@ def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d
 
 
 def _likeliest(shard: Shard, starts: list[Progress], regularisation: float) -> Progress:
-    """Run `TRIAL_STEPS` steps from each initial state; return the state of the greatest likelihood."""
+    """Run `TRIAL_STEPS` EM steps from each initial state; return the result of the greatest likelihood."""
     if len(starts) == 1:
         return starts[0]
     fits = [expectation_maximisation(shard, start, TRIAL_STEPS, 0.0, regularisation) for start in starts]

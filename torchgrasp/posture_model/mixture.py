@@ -143,7 +143,7 @@ class GraspMixture(GaussianMixture):
 
     @functools.cached_property
     def _regression(self) -> Float[Tensor, "m h 6"]:
-        """The slope of each component's mean joints over the code: Sigma_(Theta,q) Sigma_q^-1 of Eq. (23)."""
+        """The slope of each component's mean joints over the contact code: Sigma_(Theta,q) Sigma_q^-1 in Eq. (23)."""
         whitening = self._code.whitening.matrix
         return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
 
@@ -202,7 +202,7 @@ class GraspMixture(GaussianMixture):
         return modes[..., :-1], modes[..., -1]
 
     def _log_responsibility(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m"]:
-        """Return the log of each component's responsibility h_i for a code (Eq. 23), without underflow far from all."""
+        """Return the logarithm of the responsibility h_i of each component for a code, Eq. (23), free of underflow."""
         return torch.log_softmax(self._code.log_joint(q), dim=-1)
 
     @checked

@@ -59,7 +59,7 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
 
 
 def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
-    """Return the masks of a list, or of an array (k, h, w) or (k, 1, h, w), or None for anything else."""
+    """Return several masks, given as a list or as an array (k, h, w) or (k, 1, h, w); None for anything else."""
     if isinstance(labels, Tensor | np.ndarray):
         several = len(shape) == 2 and tuple(labels.shape[1:]) in (shape, (1, *shape))
         return labels.reshape(-1, *shape) if several else None
@@ -219,7 +219,7 @@ def label_again(
 
 
 def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> Int[Tensor, "h w"]:
-    """Return the labels of objects beside a target; the target, and strips of its object around its mask, become 0."""
+    """Return labels without the target, strips of its object around `mask`, and specks: these become 0."""
     from scipy.ndimage import binary_dilation
 
     about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
@@ -229,10 +229,10 @@ def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> I
 
 
 def _on_support(image: DepthImage, support: Support) -> Bool[Tensor, "h w"]:
-    """Return a mask of the pixels on the support or below it; other pixels that a mask loses are flying pixels."""
+    """Return a mask of the measured pixels that lie on the plane of the support or below it."""
     return (image.depth > 0) & (support.plane.height(image.points()) < 0.01)
 
 
 def _removed(mask: str, count: int, seen: int, where: str = "the support") -> list[str]:
-    """Return a list with a note on the pixels that were removed from a mask; it is empty if they are few."""
+    """Return a list with one sentence that `count` of `seen` pixels were removed from a mask; empty if they are few."""
     return [f"{mask}: {count} of {seen} pixels lie on {where} and were removed"] if count > 0.05 * seen else []

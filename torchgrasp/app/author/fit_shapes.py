@@ -188,7 +188,7 @@ def _cut(points: Points, most: int, saving: float) -> list[Corners]:
 
 
 def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[float, list]]:
-    """Return for each cut of a box along an axis the saved volume and both parts, at least 8 mm long on that axis."""
+    """Return each way to cut a box in two across an axis: the saved volume and both parts, each over 8 mm thick."""
     found = []
     for axis in range(3):
         for at in np.linspace(low[axis], high[axis], 12)[1:-1]:

@@ -217,7 +217,7 @@ def _cast(
 
 
 def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return for all integers in the ranges [begin, end) the index of the range, and the integer."""
+    """List all integers in the ranges [begin, end): return the index of each one's range, and the integers."""
     counts = np.maximum(end - begin, 0)
     owner = np.repeat(np.arange(len(begin)), counts)
     start = np.cumsum(counts) - counts

@@ -181,7 +181,7 @@ def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]
 
 
 def _mirror(parts: list[_Part]) -> list[_Image]:
-    """Return the mirror images of each part, in each plane and in pairs of planes."""
+    """Return the mirror images of each part of the cloud in its symmetry planes, singly and in pairs."""
     total, images, before = sum(len(part.planes) for part in parts), [], 0
     for part in parts:
         scorer, points, normals = part.scorer, part.scorer.points[part.rows], part.scorer.normals[part.rows]
@@ -199,7 +199,7 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
 
 
 def _mirror_in(scorer: SymmetryScorer, number: int, plane: Mirror, score: float) -> Callable[[_Image], _Image]:
-    """Return the function that mirrors an image in the plane of index `number`; nearby planes give its errors."""
+    """Return a function that mirrors points in a plane; how images in nearby planes differ gives the points' errors."""
     steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype)
     near = planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps)
     weight = torch.softmax(scorer.score(near)[0] / TEMPERATURE, 0)

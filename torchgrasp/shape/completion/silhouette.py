@@ -67,7 +67,7 @@ class Silhouette(Value):
         return dataclasses.replace(self, viewpoint=viewpoint, axes=axes, rim=rim, rim_normals=rim_normals)
 
     def _look_up(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the distance to the outline at depth 1, the visible depth [m], and the point's own depth [m]."""
+        """Return each point's distance to the outline at depth 1, the depth [m] seen there, and its own depth [m]."""
         local = (points - self.viewpoint) @ self.axes.T
         depth = local[..., 2].clamp_min(1e-9)  # behind the camera is far outside
         position = (local[..., :2] / depth[..., None] - self.corner) / self.cell

@@ -210,7 +210,7 @@ def _plane_grid(scorer: SymmetryScorer, directions: Directions, count: int = OFF
 
 
 def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: View) -> list[tuple[int, int]]:
-    """Return (direction, offset) indices of the best planes that differ in direction and may have hidden images."""
+    """Return (direction, offset) indices of the best planes, unlike in direction, that map seen points to hidden."""
     best, offset = scores.max(1)
     hides = _hides(directions, across)
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if hides[i]]
@@ -224,7 +224,7 @@ def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: V
 
 
 def _hides(directions: Directions, across: View) -> Bool[Tensor, "d"]:
-    """Return which planes, given by normals, can have hidden mirror images in the view `across`; all if it is None."""
+    """Return which mirror planes, given by normals, can map seen points to hidden ones; all if `across` is None."""
     return torch.ones(len(directions), dtype=torch.bool) if across is None else (directions @ across).abs() > MIN_FACING
 
 
