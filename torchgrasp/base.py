@@ -152,7 +152,7 @@ def join(parts: Sequence[SomeBatch]) -> SomeBatch:
 
 
 def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch:
-    """Return a batch with the row of `new` where `choose` is True, and the row of `old` where it is False."""
+    """Return a batch that takes each row from `new` where `choose` is True, and from `old` where it is False."""
     return map_tensors(lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
 

@@ -216,7 +216,7 @@ class TrialSpec(Value):
 
     @property
     def components(self) -> ClosingOptions:
-        """The options of the closing mode, all off for modes without options."""
+        """The options of the closing mode; all are off for a mode that has no options."""
         return choose_options(self.closing, self.options)
 
 

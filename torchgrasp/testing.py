@@ -94,7 +94,7 @@ def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
 
 
 def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
-    """Return the names of the two links that overlap in the most postures."""
+    """Return the names of the two links of a hand that overlap in the most of n postures."""
     apart = hand.self_collision.separations(hand.tree.frames(hand.expand_joints(joints).T.contiguous()), 0.0)
     links = hand.self_collision.link[hand.self_collision.pairs[int((apart < 0).sum(1).argmax())]]
     one, two = (hand.tree.link_names[int(k)] for k in links)

@@ -18,7 +18,7 @@ _state = {"calls": 0, "before": 1}
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread within the context; the number of threads is restored afterwards."""
+    """Let torch use one thread within the context, and restore the number of threads afterwards."""
     if getattr(_here, "inside", False):
         yield
         return

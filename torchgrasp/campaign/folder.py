@@ -116,7 +116,7 @@ class _Store:
             self._close(k)
 
     def missing(self) -> list[int]:
-        """Return the indices of the jobs that still have to run."""
+        """Return the indices of the jobs whose results are not yet in the folder."""
         return [j for j in range(len(self.campaign.rows)) if j not in self.rows]
 
     def put(self, j: int, data: bytes) -> JobRow:

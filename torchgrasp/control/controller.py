@@ -212,7 +212,7 @@ def make_closing(reference: ClosingReference, mode: ClosingMode, options: Closin
 def choose_holding(
     hand: Hand, mode: HoldingMode
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
-    """Return the constructor of a mode's hold controller, or None if the closing controller itself holds the object."""
+    """Return the function that makes a mode's hold controller; None if the closing controller goes on to hold."""
     if mode == "impedance":
         hand.require_three("holding", "'impedance', whose virtual frame is of three,")
         return functools.partial(Impedance, stability=load_stability(hand))

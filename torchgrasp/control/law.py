@@ -59,12 +59,12 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
 
 
 def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the position gain [1/s] on each axis (Eq. 27 of the paper): a constant divided by the axis's variance."""
+    """Return the position gain [1/s] on each axis: a constant over the axis's variance, Eq. (27) of the paper."""
     return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
 
 def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float) -> Float[Tensor, "*b 3"]:
-    """Return the force gain [m/(s N)] on each axis (Eq. 28 of the paper): alpha_f [m N/s] over the axis's variance."""
+    """Return the force gain [m/(s N)] on each axis: alpha_f [m N/s] over the axis's variance, Eq. (28) of the paper."""
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)
     return alpha_f[..., None] / diagonal if isinstance(alpha_f, Tensor) else alpha_f / diagonal
 

@@ -99,11 +99,11 @@ class Touches:
 
     @property
     def felt(self) -> Bool[Tensor, "f"]:
-        """Whether each fingertip still touches and has reported where."""
+        """A mask of the fingertips that still touch the object and have reported where they touch."""
         return self.contact & (self.count > 0)
 
     def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """Return mean contact points [m] and unit normals; both are zero for fingertips that reported no contact."""
+        """Return each fingertip's mean contact point [m] and unit normal; zero for fingertips without contact."""
         return self.points / self.count.clamp_min(1)[:, None], unit(self.normals)
 
 

@@ -129,12 +129,12 @@ class ClosingReference(Value):
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
-        """Return all joints of the URDF [rad] that belong to given actuated joints [rad]; NaN is allowed."""
+        """Return the positions of all joints of the URDF [rad], given the actuated joints [rad]; NaN is allowed."""
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
-        """Return the actuated joints [rad] among all joints of the URDF [rad]; NaN is allowed."""
+        """Return the actuated joints [rad], given the positions of all joints of the URDF [rad]; NaN is allowed."""
         return joints[self._actuated]
 
     @functools.cached_property

@@ -62,7 +62,7 @@ class GraspShards:
 
     @functools.cached_property
     def starts(self) -> list[int]:
-        """The index of each job's first grasp, and the total number of grasps at the end."""
+        """The index of the first grasp of each job in the data set; the last entry is the total number of grasps."""
         return list(itertools.accumulate((row.grasps for row in self.jobs), initial=0))
 
     def __len__(self) -> int:

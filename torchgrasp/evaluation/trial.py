@@ -148,7 +148,7 @@ class TrialRun:
 
     @property
     def starts(self) -> bool:
-        """Whether the initial penetration of the hand is within the trial's limit."""
+        """Whether the hand's initial penetration of the object is within the limit, so that the trial starts."""
         return self.overlap <= self.spec.overlap
 
     def approach(self) -> Iterator[None]:
@@ -188,12 +188,12 @@ class TrialRun:
 
     @property
     def felt(self) -> tuple[float, float]:
-        """The controller's estimates of friction and load [N]; NaN unless it holds the object in the mode "grip"."""
+        """The controller's estimates of friction coefficient and load [N]; NaN unless it holds in the mode "grip"."""
         hold = self.controller.hold
         return (hold.friction.mean, hold.weight) if isinstance(hold, GripHold) else (math.nan, math.nan)
 
     def strained(self) -> bool:
-        """Return whether a joint's drive is at its torque limit."""
+        """Return whether any joint's drive would need its greatest torque or more to reach its target."""
         reference = self.robot.reference
         effort = torch.tensor([reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names])
         return bool((reference.kp * (self.controller.targets.joints - self.observation.joints).abs() >= effort).any())

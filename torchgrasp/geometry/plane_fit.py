@@ -42,7 +42,7 @@ class PlaneFit:
     count: int
 
     def turned_up(self, view: "View") -> "PlaneFit":
-        """Return the plane with its normal along `up`, else towards the camera, else to the side with more points."""
+        """Return the plane with its normal turned up, else towards the camera, else to the side with most points."""
         if view.sky is not None:
             side = float(self.normal @ view.sky)
         elif view.eye is not None:

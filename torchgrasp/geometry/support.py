@@ -183,7 +183,7 @@ class Hull:
         return cls(points[torch.from_numpy(hull.vertices).long()], torch.from_numpy(hull.equations))
 
     def holds(self, points: Float[Tensor, "n 2"], margin: float = 0.0) -> Bool[Tensor, "n"]:
-        """Return which points are in the polygon or at most `margin` [m] outside; a negative margin shrinks it."""
+        """Return which points lie in the polygon or at most `margin` [m] outside; a negative margin shrinks it."""
         return (points @ self.sides[:, :2].T + self.sides[:, 2] < margin).all(-1)
 
     @property

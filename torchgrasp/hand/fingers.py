@@ -137,12 +137,12 @@ class Fingertips(Value):
 
     @property
     def cone(self) -> Float[Tensor, "f"]:
-        """Half angle [rad] of the cone about each pad's axis in which the tip may touch."""
+        """The half angle [rad] of each pad's cone: the tip may touch only within this angle of the pad's axis."""
         return torch.where(self.radius > 0, ROUND_PAD, FLAT_PAD).to(self.radius)
 
     @functools.cached_property
     def in_carriers(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """Contact points, normals and centres of the pads, in the frames of the carriers (see `Fingertips`)."""
+        """Contact points [m], unit normals and centres [m] of the pads, each in the frame of the tip's carrier link."""
         pose = self.carrier_from_tip
         contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
         return contact, map_directions(pose, self.normal)[..., 0].T, center

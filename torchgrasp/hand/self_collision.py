@@ -94,7 +94,7 @@ class SelfCollision(Value):
 
     @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
-        """Return the same shapes with only the pairs in the mask `kept`."""
+        """Return the shapes with only the pairs in the mask `kept`; other pairs are no longer tested for collision."""
         one, two, three = (int(kind.sum()) for kind in kept.split(self.kinds))
         return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 

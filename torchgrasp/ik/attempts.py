@@ -163,7 +163,10 @@ class CobylaRun:
         self.last: tuple[bytes, float, np.ndarray] | None = None
 
     def place(self, x: np.ndarray) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
-        """Return joints, link frames and hand pose (Eq. 24) at COBYLA's variables `x`, and whether the pose exists."""
+        """Return joints, link frames and hand pose at COBYLA's variables `x`, and whether the pose exists.
+
+        The pose follows from Eq. (24) of the paper; it does not exist if the fingertips are on a line.
+        """
         step = ANGLE * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
         joints = (self.first + step).clamp(self.hand.lower.to(step), self.hand.upper.to(step))
         frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())
@@ -173,7 +176,7 @@ class CobylaRun:
         return joints, frames, virtual_frame(self.points) @ inverse(virtual_frame(tips)), True
 
     def tips(self, frames: Float[Tensor, "3 4 l 1"]) -> Float[Tensor, "3 3"]:
-        """Return the contact points [m] of the fingertips in the hand's frame."""
+        """Return the contact points [m] of the fingertips in the hand's frame, given the link frames."""
         return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.contact)[..., 0].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:

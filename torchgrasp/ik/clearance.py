@@ -131,7 +131,7 @@ class CollisionWorld(Value):
 
 
 def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
-    """Return the coordinates [m] of points along a plane's normal."""
+    """Return the coordinates [m] of points along the normal of a plane, before its offset is subtracted."""
     return points @ plane.normal.to(points)
 
 
@@ -195,7 +195,11 @@ def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: boo
 
 
 def link_clearance(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Float[Tensor, "g"]]:
-    """Return each hand's least clearances [m]: links (no tips if `tips_touch`) and tips from object, all from table."""
+    """Return three least clearances [m] of each hand.
+
+    They are of links from the object (tips are left out if `tips_touch`), of tips from the object, and of all links
+    from the table.
+    """
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres
     radius = spheres.radius.to(centres)

@@ -141,7 +141,7 @@ def is_known(shape: ShapeGP, grasps: Grasps, friction: float) -> Bool[Tensor, "g
 
 
 def largest_known() -> float:
-    """Return the largest half size [m] (distance from centre to surface) of the objects that support predictions."""
+    """Return the largest half size [m] (from centre to surface) of objects for which success is predicted."""
     return _read_model()["range"]["half_size"][1]
 
 

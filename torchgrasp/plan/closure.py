@@ -100,7 +100,7 @@ def wrenches(points: Vectors, normals: Vectors, friction: float, edges: int = 8)
 
 
 def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
-    """Return the ratio of the smallest to the largest singular value of each grasp's wrench matrix."""
+    """Return each grasp's ratio of the smallest to the largest singular value of its wrench matrix (6 x f e)."""
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
 

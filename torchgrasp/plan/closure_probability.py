@@ -60,7 +60,7 @@ def grid() -> Float[Tensor, "23"]:
 
 
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
-    """Return the weights of k nodes (in descending order) that interpolate linearly at positions `at`."""
+    """Return the weights of k nodes at positions in descending order, for linear interpolation at positions `at`."""
     held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
     gaps = nodes[:-1] - nodes[1:]
     share = ((nodes[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
@@ -74,7 +74,7 @@ def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
-    """Return the posterior of the surface on the normal line of each contact; raises as `closure_probability`."""
+    """Return the posterior of the surface along each contact's normal line; errors are as in `closure_probability`."""
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
         check_tensor(f"contacts.{name}", value, (len(contacts), f, 3))

@@ -63,12 +63,12 @@ def device_of(shape: Shape) -> torch.device:
 
 
 def walls_of(shape: AnyShape) -> tuple[AnyShape, ...]:
-    """Return the surfaces of a shape, each as a shape: two for an open vessel, else the shape itself."""
+    """Return the surfaces of a shape as shapes: the outer and inner wall of an open vessel, else the shape itself."""
     return getattr(shape, "walls", (shape,))
 
 
 def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tensor, "b f"]]]:
-    """Return each surface of a shape with the mask of the contacts that are on it."""
+    """Return each surface (wall) of a shape, together with a mask (b, f) of the contacts that lie on it."""
     walls = walls_of(shape)
     if len(walls) == 1:
         return [(walls[0], torch.ones(points.shape[:2], dtype=torch.bool, device=points.device))]
@@ -131,7 +131,7 @@ class Constraints(Batch):
 
     @property
     def jacobian(self) -> Float[Tensor, "b r u"]:
-        """The Jacobian of `values`."""
+        """The Jacobian of all constraint `values` by the u unknowns."""
         return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 

@@ -32,7 +32,7 @@ class SeededContacts(NamedTuple):
     seeds: IKSeeds
 
     def select(self, rows: Int[Tensor, "k"]) -> "SeededContacts":
-        """Return the contact sets with given indices, with their certificates and seeds."""
+        """Return the contact sets with given indices, with their certificates and initial hand postures (seeds)."""
         number = rows.new_full((len(self.contacts),), -1)
         number[rows] = torch.arange(len(rows), device=rows.device)
         seeds = self.seeds[number[self.seeds.row] >= 0]

@@ -36,7 +36,7 @@ class Losses(Value):
 
     @property
     def kept(self) -> int:
-        """The number of things that the stage did not lose."""
+        """The number of things that the stage was given and did not lose."""
         return self.given - sum(self.lost.values())
 
     @property
@@ -84,7 +84,7 @@ class Funnel(Value):
 
     @property
     def reason(self) -> Status:
-        """The most frequent reason for losses in the stage `worst`; `Status.OK` if nothing was lost."""
+        """The most frequent reason why the stage `worst` lost things; `Status.OK` if it lost nothing."""
         return next(iter(self.worst.lost), Status.OK)
 
     @checked

@@ -260,7 +260,7 @@ def _refused(hand: Hand, reason: str) -> Grasps:
 
 
 def no_grasps(hand: Hand) -> Grasps:
-    """Return an empty set of grasps of a hand."""
+    """Return an empty set of grasps that has the joints and fingers of a hand."""
     f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:

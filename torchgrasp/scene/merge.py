@@ -134,7 +134,7 @@ class _Body:
 
     @property
     def size(self) -> float:
-        """The longest side [m] of the box about the points."""
+        """The longest side [m] of the bounding box of the body's points."""
         return float((self.points.amax(0) - self.points.amin(0)).max())
 
 

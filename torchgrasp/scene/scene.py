@@ -260,7 +260,7 @@ class Scene(Value):
 
     @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
-        """Return a mask of the points of an object, by default the target; all are False if there is no target."""
+        """Return a mask of the points of an object, by default the target; it is all False if there is no target."""
         label = self.target if label is None else label
         return torch.zeros_like(self.labels, dtype=torch.bool) if label is None else self.labels == label
 

@@ -28,12 +28,12 @@ class Normalisation(Value):
 
     @checked(gradients=True)
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Map points [m] to the normalised frame."""
+        """Return points [m], given in the cloud's frame, in the normalised frame (centred and scaled)."""
         return (points - self.center.to(points)) / self.scale
 
     @checked(gradients=True)
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Map normalised points to the cloud's frame [m]."""
+        """Return normalised points in the cloud's frame [m]."""
         return x * self.scale + self.center.to(x)
 
 
@@ -56,7 +56,7 @@ class Observations(Batch):
     normal_noise: Float[Tensor, "n"]
 
     def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return all observed numbers and their noise variances: distances first, then normals by component."""
+        """Return all observed numbers and the variances of their noise: first distances, then normals by component."""
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
         return y, noise * noise
@@ -67,7 +67,7 @@ class Observations(Batch):
         return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).min())
 
     def with_normals_first(self) -> "Observations":
-        """Return the observations reordered: those with normals first."""
+        """Return the observations in another order: first those with normals."""
         return self[torch.argsort(~self.has_normal, stable=True)]
 
 

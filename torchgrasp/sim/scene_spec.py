@@ -115,7 +115,7 @@ class SceneSpec:
 
     @functools.cached_property
     def slides(self) -> list["Slide"]:
-        """The prismatic joints of the mount, in their order from the world to the hand."""
+        """The prismatic joints of the mount, which carries the hand; in order from the world to the hand."""
         slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, self.travel + 0.05, 0.0)]
         length = float(np.linalg.norm(self.approach))
         if length > 0:

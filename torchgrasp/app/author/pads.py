@@ -31,7 +31,7 @@ Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 
 
 class Guess(NamedTuple):
-    """Guessed fingertip pads, direction to each finger's end in its tip's frame, and direction out of the palm."""
+    """A guess at fingertip pads, the direction of each finger in its tip's frame, and the palm's outward direction."""
 
     pads: tuple[Pad, ...]
     outward: tuple[Vector, ...]
@@ -83,7 +83,7 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
     points, directions = map_points(frames, contacts), map_directions(frames, normals)
 
     def share(tips: tuple[int, ...]) -> float:
-        """Return the fraction of the postures in which all these pads face the centroid of their contacts."""
+        """Return the fraction of postures in which the pads of these tips all face the centroid of their contacts."""
         inward = points[:, tips].mean(1, keepdim=True) - points[:, tips]
         length = torch.linalg.vector_norm(inward, dim=0)
         facing = (directions[:, tips] * inward).sum(0) / length.clamp_min(1e-9)

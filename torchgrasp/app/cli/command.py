@@ -127,7 +127,7 @@ class Progress:
         self.bar = make_bar(len(names), "stage", desc=names[0], delay=1)
 
     def end(self, name: str, message: str, value: Any = None) -> None:
-        """Print a line for the stage `name` that has ended, and keep its `value`; the bar shows the next stage."""
+        """Print that the stage `name` has ended, and keep its `value` (result); the bar then shows the next stage."""
         now = time.perf_counter()
         self.stages.append((name, message, now - self.began))
         self.values[name] = value

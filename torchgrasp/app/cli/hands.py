@@ -141,7 +141,7 @@ def print_faults(hand: str | Path, fingers: str = "default") -> bool:
 
 
 def describe_sets(hand: Hand) -> str:
-    """Return a text that lists the sets of fingers that a hand declares."""
+    """Return a text that lists the declared sets of fingers with which a hand can grasp."""
     rows = [(one.source.option, ", ".join(one.finger_names)) for one in finger_sets(hand, "auto")]
     return f"sets of fingers:\n{format_columns(rows, left={0, 1})}"
 

@@ -239,7 +239,7 @@ def _shade(triangles: Triangles, camera: Camera) -> Float[np.ndarray, "t 3 3"]:
 
 
 def rgb(color: str) -> tuple[float, float, float]:
-    """Return red, green and blue in [0, 1] of a colour "#rrggbb"."""
+    """Return the red, green and blue parts, each in [0, 1], of a colour written as "#rrggbb"."""
     red, green, blue = (x / 255 for x in bytes.fromhex(color[1:]))
     return red, green, blue
 

@@ -95,7 +95,7 @@ def draw_bar(share: Share, width: int = 180) -> Any:
 
 
 def swatch(share: float) -> Any:
-    """Return an HTML bar whose length is a fraction of 160 pixels."""
+    """Return an HTML bar that shows a success rate in [0, 1] as a fraction of 160 pixels."""
     from markupsafe import Markup
 
     return Markup(f'<span class="swatch" style="width:{160 * share:.0f}px"></span>')

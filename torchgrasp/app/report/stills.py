@@ -126,7 +126,7 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
 
 
 def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
-    """Return the one of n postures in which the fingertip pads face each other best, if possible without collision."""
+    """Return that of n postures in which the fingertip pads face each other best, without collision if possible."""
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
     facing = (normals * unit(inward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(inward, dim=-1).amax(1)

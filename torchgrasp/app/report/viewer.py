@@ -76,7 +76,7 @@ def format_viewer(run: Run) -> str:
 
 @functools.cache
 def three() -> str:
-    """Return the JavaScript of three.js with trackball controls, taken from trimesh's viewer."""
+    """Return the JavaScript of the library three.js with its mouse controls, from the package trimesh."""
     archive = resources.files("trimesh") / "resources" / "templates" / "viewer.zip"
     with archive.open("rb") as file, zipfile.ZipFile(file) as opened:
         template = opened.read("viewer.html.template").decode("utf-8")

@@ -86,7 +86,7 @@ class Outlines(Value):
 
     @property
     def rim(self) -> Float[Tensor, "k 3"]:
-        """Points on the outlines of all views [m]."""
+        """Points [m] on the outlines of all views, at the depth of nearby pixels."""
         return torch.cat([view.rim for view in self.views])
 
     @property
@@ -101,7 +101,7 @@ class Outlines(Value):
 
     @property
     def gap(self) -> float:
-        """Greatest width [m] of an area without measurements within an outline."""
+        """The greatest width [m] of any area without measurements within the object's outline."""
         return max(view.gap for view in self.views)
 
     @checked

@@ -75,12 +75,12 @@ class SymmetryScorer:
 
     @functools.cached_property
     def probes(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
-        """The probe points [m] and their normals."""
+        """The points [m] of the cloud that a symmetry is tested on, and their normals."""
         return self.points[self.rows], self.normals[self.rows]
 
     @functools.cached_property
     def tree(self) -> "KDTree":
-        """The search tree of the cloud's points."""
+        """The k-d tree over all points of the cloud, for finding nearest neighbours."""
         from scipy.spatial import KDTree
 
         return KDTree(self.points.numpy(), leafsize=32)
