@@ -50,7 +50,7 @@ class ObjectMotion(NamedTuple):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Disturbance(Value):
-    """Unintended contacts of the hand in a trial.
+    """Unintended contacts of the hand in a simulated trial, of three kinds.
 
     The three columns are contacts with neighbours, with the table, and contacts of links other than fingertips with the
     object.

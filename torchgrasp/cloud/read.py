@@ -29,7 +29,7 @@ from torchgrasp.values import PointCloud
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
-    """A cloud as it was read from a file, and `notes`, a sentence for each kind of data that was left out.
+    """A cloud read from a file; `notes` holds a sentence for each kind of data in the file that was left out.
 
     >>> import tempfile
     >>> from pathlib import Path

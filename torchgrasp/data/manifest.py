@@ -58,7 +58,7 @@ class ObjectEntry:
 
 @checked
 def read_entry(objects: Path | str, name: str) -> ObjectEntry:
-    """Return an object's entry in the manifest, checked.
+    """Return the description of an object from its folder's manifest, after a check.
 
     Raises:
         DatasetError: no such object, a missing field, a field of a wrong type or range, or a name that cannot be the
@@ -69,7 +69,7 @@ def read_entry(objects: Path | str, name: str) -> ObjectEntry:
 
 @checked
 def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, ObjectEntry | DatasetError]:
-    """Return each object's entry in the manifest, sorted by name, or the error of a bad entry.
+    """Return for each object, sorted by name, its description from the manifest, or the error of a bad description.
 
     Raises:
         DatasetError: no manifest, or none of the objects in it.
@@ -214,7 +214,7 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
 
 @checked
 def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
-    """Return the true mesh of an object; raises as `read_entry` and `read_mesh`.
+    """Return the true, closed mesh [m] of an object in a folder; raises the errors of `read_entry` and `read_mesh`.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

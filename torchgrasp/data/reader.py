@@ -72,7 +72,7 @@ class GraspShards:
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, i: int) -> dict[str, Tensor]:
-        """Return grasp i as a dict of tensors.
+        """Return grasp i of the data set, with its cloud, as a dict of tensors by name.
 
         Raises:
             IndexError: no such grasp.
@@ -95,7 +95,7 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Return job j, with all numbers in the precision of the file.
+        """Return the cloud, the grasps and the results of trials of job j, in the precision of the file.
 
         Raises:
             IndexError: no such job.

@@ -55,7 +55,7 @@ def list_objects() -> tuple[str, ...]:
 
 @checked
 def load_object(name: str) -> GraspObject:
-    """Return a shipped object by name.
+    """Return the shipped object with the given name: its mesh, mass and a noisy view.
 
     Raises:
         BadArgument: no such object.

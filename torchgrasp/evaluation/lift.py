@@ -117,7 +117,7 @@ class _ObjectLost(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class _Tick(Value):
-    """The simulated state at one control tick, or with a leading axis the states at all ticks.
+    """The state of the simulation at one control tick; with a leading axis, the states at all ticks.
 
     `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `felt` holds the controller's
     estimates of friction and load [N], `truth` the true contacts.

@@ -57,7 +57,7 @@ class Protocol(Value):
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":
-        """Return the protocol with some settings of its trial changed.
+        """Return the protocol with the given settings of its simulated trial replaced.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'

@@ -114,9 +114,9 @@ class SelfCollision(Value):
     def _near(
         self, frames: Float[Tensor, "3 4 l n"], below: float
     ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"]]:
-        """Return the placed shapes, the separations of the bounding spheres of each pair, and two indices.
+        """Return the placed shapes, the separations [m] of the bounding spheres of each pair, and two index vectors.
 
-        They are the pair and the posture of each separation that is less than `below`.
+        The index vectors hold the pair and the posture of each separation that is less than `below`.
         """
         shapes = self._place(frames)
         distance = self._distances(shapes[1])

@@ -34,7 +34,7 @@ SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z"
 @checked
 @dataclasses.dataclass(frozen=True)
 class Neighbour:
-    """Another body on the table, beside the object.
+    """Another body on the simulated table, beside the object to grasp.
 
     Args:
         mesh: closed mesh [m] in the frame of the grasp.
@@ -64,7 +64,7 @@ class Body:
 
 @dataclasses.dataclass(frozen=True)
 class SceneSpec:
-    """Parameters of a simulated scene.
+    """Parameters of a simulated scene: a hand on its mount, the object, the table and neighbours.
 
     Args:
         urdf_path: URDF of the hand.

@@ -22,7 +22,7 @@ SHARE_NAMES = {
 
 @checked
 def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> Path:
-    """Write the page of an evaluation, atomically.
+    """Write the HTML page with an evaluation's settings and scores, atomically.
 
     Args:
         path: file to write.

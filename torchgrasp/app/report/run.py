@@ -33,7 +33,7 @@ LOST = "lost"  # name of the moment at which an object was lost
 @checked
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The data of one run that a report shows.
+    """The inputs and results of one planning run, which a report shows.
 
     Args:
         object_name: name of the object in titles and sentences.
