@@ -83,7 +83,7 @@ def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> lis
         others = [other for other in done if other is not body]
         nearest = min(others, key=lambda other: between(body, other), default=body)
         reach = FAR if body.size < 0.7 * nearest.size else GAP
-        if body in done and nearest is not body and between(body, nearest) < reach:
+        if body in done and nearest is not body and between(body, nearest) < reach and not _upon(body, nearest):
             done = [other for other in others if other is not nearest] + [body + nearest]
     return done
 
@@ -144,7 +144,7 @@ def _one_body(a: _Body, b: _Body, gap: float) -> bool:
         return gap == 0.0
     small, large = (a, b) if a.count < b.count else (b, a)
     over = float(large.hull.holds(small.points[:, :2]).double().mean())
-    if not _apart(small, large, over) if gap < GAP else over > NESTED:
+    if not _apart(small, large, over) and (gap < GAP or over > NESTED):
         return True
     hull = Hull.of(torch.cat([a.hull.corners, b.hull.corners]))
     if hull.width < 0.025 and min(a.foot, b.foot) > 0.01:  # a standing ring from its edge: none of its parts stands
@@ -158,11 +158,15 @@ def _one_body(a: _Body, b: _Body, gap: float) -> bool:
 
 def _apart(small: _Body, large: _Body, over: float) -> bool:
     """Return whether two bodies that touch are two objects: side by side on the table, or one upon the other."""
-    if small.count < 0.1 * large.count:
-        return False
-    if over < 0.3:
-        return all(body.foot < max(0.015, 0.5 * body.top) for body in (small, large))
-    return over > 0.5 and small.top > large.top + 0.01 and small.foot > 0.5 * large.top
+    beside = over < 0.3 and all(body.foot < max(0.015, 0.5 * body.top) for body in (small, large))
+    return (beside and small.count > 0.1 * large.count) or _upon(small, large)
+
+
+def _upon(small: _Body, large: _Body) -> bool:
+    """Return whether a body is an object that lies upon another one: a lid or a knob is smaller."""
+    over = float(large.hull.holds(small.points[:, :2]).double().mean())
+    higher = small.top > large.top + 0.01 and small.foot > 0.5 * large.top
+    return over > 0.5 and higher and small.count > 0.1 * large.count
 
 
 def _floating(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
