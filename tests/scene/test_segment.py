@@ -106,8 +106,9 @@ def test_a_mug_with_its_handle_and_a_standing_ring_are_one(elevation, turn):
             trimesh.creation.cylinder(0.035, 0.1).apply_translation([0, 0, 0.05]),
             box([0.1, 0.06, 0.06], [0.02, 0.066, 0.03]),
         ],
+        [box([0.16, 0.16, 0.05], [0, 0, 0.025]), box([0.07, 0.09, 0.06], [-0.02, 0.01, 0.08])],
     ],
-    ids=["boxes", "can and box"],
+    ids=["boxes", "can and box", "upon"],
 )
 def test_objects_that_touch_are_cut_at_the_crease_and_told(meshes):
     image, labels = look(meshes, 45.0)
