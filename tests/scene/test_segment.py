@@ -10,7 +10,7 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage
-from torchgrasp.scene.merge import find_touching
+from torchgrasp.scene.merge import find_touching, merge_pieces
 from torchgrasp.scene.segment import on_surface, segment
 
 TABLE = Plane.horizontal(0.0)
@@ -106,9 +106,8 @@ def test_a_mug_with_its_handle_and_a_standing_ring_are_one(elevation, turn):
             trimesh.creation.cylinder(0.035, 0.1).apply_translation([0, 0, 0.05]),
             box([0.1, 0.06, 0.06], [0.02, 0.066, 0.03]),
         ],
-        [box([0.16, 0.16, 0.05], [0, 0, 0.025]), box([0.07, 0.09, 0.06], [-0.02, 0.01, 0.08])],
     ],
-    ids=["boxes", "can and box", "upon"],
+    ids=["boxes", "can and box"],
 )
 def test_objects_that_touch_are_cut_at_the_crease_and_told(meshes):
     image, labels = look(meshes, 45.0)
@@ -134,3 +133,11 @@ def test_an_uneven_place_of_the_table_is_no_object():
     depth = torch.where(image.depth > 0, image.depth - rise / math.sin(math.radians(45.0)), 0.0)
     found = segment(DepthImage(depth, image.intrinsics, image.obj_from_camera), Support(TABLE))
     assert found.max() == 1
+
+
+def test_a_box_upon_a_box_is_an_object_and_a_knob_upon_a_box_is_a_part():
+    base, jump = box([0.16, 0.16, 0.05], [0, 0, 0.025]), torch.full((480, 640), 0.008, dtype=torch.float64)
+    for top, count in ((box([0.07, 0.09, 0.06], [0, 0, 0.08]), 2), (box([0.02, 0.02, 0.02], [0, 0, 0.06]), 1)):
+        image, labels = look([base, top], 45.0)
+        pieces = torch.where(image.depth > 0, labels, 0)
+        assert len(merge_pieces(image, pieces, TABLE, jump)[1:].unique()) == count
