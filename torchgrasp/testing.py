@@ -150,7 +150,7 @@ def _inside(point: np.ndarray, shape: Shape) -> bool:
 
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
-    """Return the largest difference of link poses from yourdfpy and pytorch-kinematics, and the name of the link."""
+    """Return the largest difference of a pose entry from yourdfpy's or pytorch-kinematics', and the link's name."""
     import yourdfpy
 
     urdf, poses = read_urdf(hand.urdf_path), hand.link_poses(joints).double()

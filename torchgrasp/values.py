@@ -179,7 +179,7 @@ class Certificate(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
-    """The code q of sets of three contacts, independent of the frame, for six assignments to fingers (Eq. 18).
+    """The code q of sets of three contacts, the same in every frame; one for each of six finger assignments (Eq. 18).
 
     q holds the distances [m] of the contacts from their centroid, then the cosines between their normals.
     `obj_from_vf` is the pose of a frame that the contacts define. In assignment k finger i touches contact

@@ -44,9 +44,9 @@ FIELDS = (
 
 
 class Campaign(NamedTuple):
-    """The request of a campaign, as in `campaign.json`, and one row for each job.
+    """The request of a campaign, as in `campaign.json`, and one row for each job (one view of one object).
 
-    A row whose status is not OK needs no work. `empty` makes the data of a job without grasps from its row.
+    A job whose row has a status other than OK is not run. `empty` makes the data of a job without grasps from its row.
     """
 
     asked: dict[str, Any]

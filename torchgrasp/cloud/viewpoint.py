@@ -32,7 +32,7 @@ def guess_viewpoint(
         points: points of a view [m], without outliers.
         normals: unit normals of any sign.
         up: a direction above the support; if the points show a support, its normal replaces this direction.
-        assumed: whether `up` is assumed, so that the cloud may be in its camera's frame instead.
+        assumed: whether `up` is only a guess; then the camera may also be at the origin of the cloud's frame.
     """
     rows = draw_rows(len(points), DRAWN).to(points.device)
     points, normals = points[rows], normals[rows]

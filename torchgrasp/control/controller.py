@@ -124,10 +124,10 @@ class GraspController:
     def step(self, observation: Observation, period: Period) -> Targets:
         """Return the targets of joints and palm for the next tick, which comes `period` [s] later.
 
-        In the tick in which the closing ends, the targets do not change, because that tick computes the hold's forces.
+        In the tick in which the closing ends, the targets do not change: that tick computes the forces of holding.
 
         Raises:
-            BadArgument: an observation of another hand, or on another device than the CPU; a period outside `Period`.
+            BadArgument: an observation of another hand, or on a device other than the CPU; a period out of range.
         """
         shape = len(self.reference.normals), 3, len(self.targets.joints)
         found = tuple(observation.jacobian.shape)

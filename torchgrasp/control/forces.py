@@ -91,7 +91,7 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return joint targets [rad] and torques [N m] with which drives of a `stiffness` [N m/rad] exert given forces."""
+    """Return targets [rad] and torques [N m] with which joint drives of a `stiffness` [N m/rad] exert given forces."""
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
 

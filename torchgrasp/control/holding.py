@@ -68,8 +68,8 @@ def regulate(factor: float, observation: Observation, strength: float, period: f
 def held_forces(reference: ClosingReference, observation: Observation) -> tuple[Float[Tensor, "f 3"], float]:
     """Return balanced forces [N] on the object, and the sum [N] of their normal parts at tips with a working sensor.
 
-    The forces act at the sensed contacts. If a finger does not touch, or if no balanced forces press at every contact,
-    the planned forces are returned.
+    The forces act at the sensed contacts. They sum to a zero wrench. If a finger does not touch, or if no such forces
+    exist that press at every contact, the planned forces are returned.
     """
     gains, normals = reference.gains, reference.normals
     forces = gains.desired_force

@@ -200,7 +200,7 @@ def closing_gains(
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.
 
-    They are those of Eqs. (26)-(28) of the paper. Arguments and errors are as in `ClosingReference.from_grasp`.
+    Gains and forces follow Eqs. (26)-(28) of the paper. Arguments and errors are as in `ClosingReference.from_grasp`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -22,7 +22,7 @@ MOST = 1_000_000  # most points, grasps and tries of one job
 
 
 class JobRow(NamedTuple):
-    """The outcome of one job: status, counts of grasps and trials, metadata.
+    """The outcome of one job (one view of one object): status, counts of grasps and trials, metadata.
 
     `status` is OK, or the reason why there is no grasp: the most frequent failure, a bad object, or how the process
     ended. `note` gives details. `executable` grasps were planned; `grasps` of them were kept and tried; `passed` is the
@@ -51,7 +51,7 @@ class JobRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Records(Value):
-    """The tensors of several jobs: those of the first job, then those of the next.
+    """The results of several jobs (one view of one object each), concatenated in the order of the jobs.
 
     Letters: p points, j jobs, g grasps, d trials of a grasp. A job without a camera has a viewpoint of zeros. `passed`
     and `outcome` (a `Status`) are for each simulated trial. Lengths are in metres, in the object's frame.

@@ -136,7 +136,7 @@ def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> S
 
 
 def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round to multiples of `GRID` plus a constant, because float32 numbers often lie halfway between two multiples."""
+    """Round to multiples of `GRID`, after adding a constant that keeps common float32 numbers off the midpoints."""
     return torch.round(x / GRID + 1 / math.pi) * GRID
 
 

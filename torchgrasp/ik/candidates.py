@@ -78,7 +78,7 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Hand configurations to be checked, with contacts, certificates, and the `status` of contact planning.
+    """Hand configurations to check, with contacts, force closure certificates, and the `status` of contact planning.
 
     Finger i touches contact `permutation[:, i]` of the planned contact set. `contacts` are in the order of the fingers.
     """

@@ -90,7 +90,7 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Te
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
-    """Return the upper bound of the closure margin that each witness proves; NaN if the witness proves nothing."""
+    """Return the upper bound of the closure margin that each direction `witness` in wrench space proves, or NaN."""
     # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g / sum(g - min g).
     product = (wrench @ witness[..., None])[..., 0]
     least = product.amin(-1)

@@ -127,7 +127,7 @@ class GaussianMixture(Value):
 
     @functools.cached_property
     def whitening(self) -> "Whitening":
-        """The components in whitened form, in which densities are quick to evaluate."""
+        """Each component's whitening matrix, whitened mean and log scale, which make densities quick to evaluate."""
         means, d, matrix = self.means.double(), len(self.names), whitening_matrices(self.covariances.double())
         log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * d * math.log(2 * math.pi)
         return Whitening(matrix, (matrix @ means[..., None])[..., 0], log_scale)

@@ -112,9 +112,10 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
 class GraspMixture(GaussianMixture):
     """The learned mixture over the joints and contact codes of one hand (Eqs. 19-20).
 
-    The dimensions are the joints [rad], in the hand's order, then the contact code: lengths L1 L2 L3 [m], cosines N1 N2
-    N3. The names must end with `CODE_NAMES`. `regularisation`, relative to the samples' variance, was added to every
-    variance. `meta` describes hand, samples and fit.
+    The dimensions are the joints [rad], in the hand's order, then the contact code of `ContactCode`: distances L1 L2 L3
+    [m] of the contacts from their centroid, cosines N1 N2 N3 between their normals. A contact set has 6 codes, one for
+    each assignment to fingers. The names must end with `CODE_NAMES`. `regularisation`, relative to the samples'
+    variance, was added to every variance. `meta` describes hand, samples and fit.
 
     >>> from torchgrasp import encode
     >>> from torchgrasp.data.shipped import load_shipped_grasp

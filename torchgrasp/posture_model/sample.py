@@ -48,7 +48,8 @@ def roll_contacts(
 def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -> Bool[Tensor, "n"]:
     """Return a mask of the postures of which some three contacts can balance forces in the friction cones, Eq. (13).
 
-    A grid over forces along the triangle's sides finds all but marginal closures; `normals` point into the object.
+    The search tries a grid of forces along the triangle's sides and can miss marginal cases. `normals` point into the
+    object.
     """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for three in itertools.combinations(range(points.shape[1]), 3):
@@ -107,7 +108,7 @@ class HandSamples(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
-    """The settings by which `n` postures without self-collision are drawn; `Sampling` lists the kinds.
+    """The settings by which `n` postures without self-collision are drawn; `Sampling` lists the ways to draw.
 
     Chunk i depends only on (seed, i), so a smaller set of samples is the beginning of a larger set. Raises
     `BadArgument` for values out of range.

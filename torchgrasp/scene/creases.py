@@ -95,7 +95,7 @@ def _join_parts(parts: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _borders(parts: np.ndarray) -> list[tuple[int, int]]:
-    """Return the pairs of numbers of parts that share a border of at least 5 pixels."""
+    """Return the pairs of part numbers whose parts share a border of at least 5 pixels."""
     found = []
     for one, other in ((parts[1:], parts[:-1]), (parts[:, 1:], parts[:, :-1])):
         differ = (one != other) & (one > 0) & (other > 0)

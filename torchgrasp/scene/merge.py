@@ -122,7 +122,7 @@ def _ends(points: np.ndarray) -> int:
 
 
 class _Body:
-    """Pieces of one object: their numbers, how many points they have, some points, and the hull of their footprint."""
+    """Pieces of one object: their indices, their number of points, some points, and the hull of their footprint."""
 
     def __init__(self, rows: tuple[int, ...], points: Float[Tensor, "n 3"], count: int) -> None:
         self.rows, self.count, self.points = rows, count, points[:: 1 + len(points) // 2000]

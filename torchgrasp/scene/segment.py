@@ -84,7 +84,7 @@ def _risen(smooth: DepthImage, table: Plane, mean: Tensor, threshold: Tensor) ->
 
 
 def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a mask of pixels above the table, away from depth jumps, and the depth step [m] that counts as one."""
+    """Return a mask of pixels above the table and away from depth jumps; and, per pixel, the least depth jump [m]."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     depth = smooth.depth

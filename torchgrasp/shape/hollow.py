@@ -44,7 +44,7 @@ class HollowShape(ShapeGP):
     @classmethod
     @checked
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
-        """Return the vessel with two given surfaces, in one normalised frame; `cloud` holds the seen points of both."""
+        """Return the vessel with two surfaces that share a normalised frame; `cloud` holds the seen points of both."""
         radius = min(outer.domain_radius, inner.domain_radius)
         return cls(**common_fields(outer, ShapeGP) | {"cloud": cloud, "domain_radius": radius}, inner=inner)
 
@@ -127,8 +127,9 @@ class HollowShape(ShapeGP):
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
     """Return the vessel after adding observations that give its wall the known thickness.
 
-    Two independent surfaces might touch, which tears holes into the wall. In the wall's middle the distances must add
-    up to minus the thickness; where they do not, the more certain surface gives an observed distance of the other.
+    Two independent surfaces might touch, which tears holes into the wall. In the wall's middle the signed distances
+    from both surfaces must sum to minus the thickness. Where they do not, the less certain surface gets an observed
+    distance that follows from the more certain one.
     """
     x, thickness, noise = middle.x, middle.thickness, 0.0007 / shape.scale
     for _ in range(3):

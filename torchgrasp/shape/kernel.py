@@ -26,14 +26,16 @@ NEAR_ZERO = 1e-5  # below it k'(r) / r is taken as k''(r / 2), which avoids 0 / 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Kernel:
-    """A radial kernel k(r) of normalised distances.
+    """A radial kernel k(r) of normalised distances r, with its derivatives by r^2 / 2.
+
+    Each derivative is (1/r) d/dr of the one before: k, k'/r, (k'/r)'/r, and so on; they are not k', k'', k'''.
 
     Args:
         profile: the function k(r).
         diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it is a covariance
             everywhere.
         remedy: fix that the error suggests if the covariance is not positive definite.
-        closed_form: function of `r` and `count` that returns the derivatives faster than autograd, the default.
+        closed_form: function of `r` and `count` that returns these derivatives faster than autograd, the default.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]

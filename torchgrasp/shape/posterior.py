@@ -37,7 +37,7 @@ class Posterior(Value):
 
     @cached_property
     def precision(self) -> Float[Tensor, "rows rows"]:
-        """The inverse covariance (K + noise)^-1 of the observed numbers, in the order of `weights`."""
+        """The inverse covariance (K + noise)^-1 of all observations, in the order of `weights`."""
         inverse = torch.cholesky_inverse(self.factor)
         if self.order is None:
             return inverse
@@ -158,14 +158,14 @@ class Posterior(Value):
 
     @checked
     def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
-        """Return the covariance of the distances at normalised points with all observed numbers, one row per point."""
+        """Return the covariance of the distances at normalised points with all observations, one row per point."""
         d, r = separations(x, self.x)
         k, first = self.kernel.derivatives(r, 2)
         return _distance_rows(d, k, first, self.n_oriented)
 
     @checked
     def whiten(self, rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
-        """Return rows of covariances with the observed numbers, times L^-T of the Cholesky factor L.
+        """Return rows of covariances with all observations, times L^-T of the Cholesky factor L.
 
         The dot product of two results is the covariance that the observations explain.
         """
@@ -174,7 +174,7 @@ class Posterior(Value):
 
     @checked
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
-        """Return the covariance of distance and gradient (d, w) at normalised points with all observed numbers."""
+        """Return the covariance of distance and gradient (d, w) at normalised points with all observations."""
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
     def _split_weights(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "near 3"]]:
@@ -226,7 +226,7 @@ def _jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor,
 
 
 def _distance_rows(d: list[Tensor], k: Values, first: Values, near: int) -> Float[Tensor, "q rows"]:
-    """Return the covariance of distances with the observed numbers: k, then -k' d for each component of the normals."""
+    """Return the covariance of distances with all observations: k, then -k' d for each component of the normals."""
     return torch.cat([k, *(-(part[:, :near] * first[:, :near]) for part in d)], 1)
 
 

@@ -56,14 +56,14 @@ class Observations(Batch):
     normal_noise: Float[Tensor, "n"]
 
     def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return all observed numbers and the variances of their noise: first distances, then normals by component."""
+        """Return all observed values and the variances of their noise: first distances, then normals by component."""
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
         return y, noise * noise
 
     @property
     def least_noise(self) -> float:
-        """The least standard deviation of all observed numbers."""
+        """The least standard deviation of the noise of all observed values."""
         return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).min())
 
     def with_normals_first(self) -> "Observations":

@@ -54,7 +54,7 @@ def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.
 
 
 def main(asked: dict[str, Any]) -> None:
-    """Read a mesh from stdin, cut it within the limits of `asked`, and write the convex parts to stdout."""
+    """Read a mesh from stdin, cut it within the time and memory of `asked`, and write its convex parts to stdout."""
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     _limit(asked["seconds"], asked["memory"])
     import coacd

@@ -45,8 +45,9 @@ class SimulatedHand:
     `truth` holds the contacts of the last tick. `force` (f,) are the true normal forces [N], averaged over the tick,
     `pushes` (f, 3) the full forces. `finger` (f,) tells which fingers touched the object in the last step. `steps`
     counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before it.
-    Three attributes are about the hand's other contacts, by kind as in `StepContacts.stray`: `first_stray` is the step
-    of the first contact, `stray` the sum of the impulses [N s], `most_stray` the largest force [N] over a tick.
+    Three attributes are about the hand's other contacts, with entries for neighbours, table top and target, in this
+    order: `first_stray` is the step of the first contact, `stray` the sum of the impulses [N s], `most_stray` the
+    largest force [N] over a tick.
 
     Args:
         scene: a scene at its initial state.

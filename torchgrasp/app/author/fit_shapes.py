@@ -76,7 +76,7 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 
 
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
-    """Replace every mesh by a few boxes or a cylinder around its points; also return a sentence with the numbers."""
+    """Replace every mesh by a few boxes or a cylinder around its points; also return a sentence with the counts."""
     links, count, made = [], 0, 0
     for link in urdf.links:
         shapes: list[Shape] = []

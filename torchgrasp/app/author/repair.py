@@ -129,7 +129,7 @@ def _fixed(joint: Joint, value: float) -> Joint:
 
 
 def repair_joints(urdf: Urdf) -> Step:
-    """Add missing limits and drives; make every coupled joint follow an independent joint within both limits."""
+    """Add missing position, effort and velocity limits; make coupled joints follow independent ones within limits."""
     joints = {j.name: j for j in urdf.joints}
     done = _add_limits(urdf, joints) + _add_drives(joints) + _follow_directly(joints) + _limit_leaders(urdf, joints)
     return dataclasses.replace(urdf, joints=tuple(joints.values())), done
@@ -146,7 +146,7 @@ def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 
 
 def _add_drives(joints: dict[str, Joint]) -> list[str]:
-    """Give joints without an effort or velocity limit the typical values of small hands."""
+    """Give joints without an effort or velocity limit the limits typical of small hands."""
     idle = [j for j in joints.values() if j.kind != "fixed" and not (j.effort > 0 and j.velocity > 0)]
     for j in idle:
         effort, velocity = (x if x > 0 else usual for x, usual in ((j.effort, EFFORT), (j.velocity, VELOCITY)))

@@ -123,7 +123,7 @@ class Import(Command):
             return formats.grasps_from_joints(hand, joints, poses, opened, spec, self.std)
 
     def _check(self, hand: Hand, grasps: Grasps, cloud: PointCloud) -> None:
-        """Refuse grasps that are not on the cloud; the error names the options with which they would be."""
+        """Refuse grasps that are not on the cloud; the error names options that put them there, if any do."""
         error = _contradiction(grasps, cloud)
         if error is None:
             return

@@ -90,7 +90,7 @@ class Canvas:
                 self.add_mesh(length * part.vertices @ turn.T + start, part.faces, color)
 
     def add_table(self, corners: Float[np.ndarray, "n 3"], height: float | None) -> None:
-        """Add a round table top, without shading, under `corners` at a height [m], unless the height is None."""
+        """Add an unshaded round table top at `height` [m], centred on `corners` in x and y. None adds nothing."""
         from trimesh import creation
 
         if height is None:

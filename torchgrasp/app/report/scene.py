@@ -68,7 +68,7 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-    """Return for each pixel its index in `KINDS` and the label of its object. The index counts only where that is 0."""
+    """Return each pixel's index in `KINDS` and its object's label. The index counts only where the label is 0."""
     image, labels = scene.image, np.zeros(scene.image.depth.shape, dtype=int)
     labels[tuple(scene.pixels.cpu().numpy().T)] = scene.labels.cpu().numpy()
     points, measured = image.points(), image.depth.numpy() > 0

@@ -48,7 +48,7 @@ def solids_of_links(hand: Hand) -> list[Solid]:
 def link_poses(
     hand: Hand, joints: Float[Tensor, "n j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "n 4 4"]
 ) -> Float[Tensor, "n l 4 4"]:
-    """Return the poses of all links in the object's frame; `names` are those of the `joints` [rad]."""
+    """Return the poses of all links in the object's frame; `names` are the names of the `joints` [rad]."""
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()
     return obj_from_hand.double()[:, None] @ hand.tree.poses(values)
 
@@ -56,7 +56,7 @@ def link_poses(
 def solids_from_hand(
     hand: Hand, joints: Float[Tensor, " j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "4 4"]
 ) -> list[Solid]:
-    """Return the collision shapes of a hand as meshes in the object's frame; `names` are those of `joints` [rad]."""
+    """Return the collision shapes of a hand as meshes in the object's frame; `names` name the `joints` [rad]."""
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
     return [
         solid._replace(
