@@ -153,7 +153,7 @@ def _one_body(a: _Body, b: _Body, gap: float) -> bool:
         return False
     both = torch.cat([a.points, b.points])
     high = both[both[:, 2] > max(a.top, b.top) - 0.004, :2]  # only a hollow body has no top in its middle
-    return float(hull.holds(high, -0.012).double().mean()) < 0.1
+    return float(hull.holds(high, -0.012).double().mean()) < 0.2
 
 
 def _apart(small: _Body, large: _Body, over: float) -> bool:
