@@ -6,7 +6,7 @@ gpu    kernels: every kernel of the chain on a GPU beside the CPU
 hand   fk, collision, codes: kinematics beside pytorch-kinematics, self-collision and inverse kinematics
 load   plans, trials, points, starts: memory over many plans and trials, and of large inputs
 plan   truth, fields, executable, certificates: the contact planner on the true surface and in exact arithmetic
-scene  plane, click, rooms, whole, clutter, clear: depth images, and lifts among neighbours
+scene  plane, click, rooms, real, whole, clutter, clear: depth images, and lifts among neighbours
 shape  objects, weaker: the estimated shape against true meshes
 
 Each bench prints rows, and writes them as JSON and as a Markdown table with commit, machine and command. Times are for

@@ -9,6 +9,7 @@ from torchgrasp.geometry.linalg import (
     cholesky,
     farthest_points,
     limit_norm,
+    number_components,
     solve_least_squares,
     squared_mahalanobis,
     unit,
@@ -104,3 +105,18 @@ def test_least_squares_have_the_same_bits_in_every_call(generator):
         used = torch.full((size,), 7)
         del used
         assert torch.equal(solve_least_squares(rows, values), first)
+
+
+def test_tests_check_annotations_a_wrong_rank_letter_and_type_are_refused():
+    rows, values = torch.rand(4, 2).double(), torch.rand(4).double()
+    assert solve_least_squares(rows, values).shape == (2,)
+    for arguments in ((values, values), (rows, values[:3]), (rows.long(), values)):
+        with pytest.raises(TypeError):
+            solve_least_squares(*arguments)
+    with pytest.raises(TypeError):
+        limit_norm(rows, "1")  # pyright: ignore[reportArgumentType]
+
+
+def test_components_are_those_of_the_pairs_and_keep_the_order_of_nodes():
+    assert number_components(np.array([[3, 1], [4, 3]]), 6).tolist() == [0, 1, 2, 1, 1, 3]
+    assert number_components(np.empty((0, 2), dtype=np.int64), 3).tolist() == [0, 1, 2]

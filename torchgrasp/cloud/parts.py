@@ -10,6 +10,7 @@ from torch import Tensor
 from torchgrasp.checks import Range, checked
 from torchgrasp.cloud.check import MIN_POINTS, first_of_each
 from torchgrasp.errors import NoSupport, TooFewPoints
+from torchgrasp.geometry.linalg import number_components
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support, find_supports
 from torchgrasp.values import PointCloud
@@ -20,8 +21,6 @@ GAP = 0.04  # least distance [m] between bodies; a bent or hidden surface of one
 
 def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, "n"]:
     """Return the group number of each point; groups are more than `gap` [m] apart, and group 0 is the largest."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
     device, points = points.device, points.cpu()
@@ -31,8 +30,7 @@ def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, 
     _, group = torch.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_inverse=True)
     first = first_of_each(group)
     pairs = KDTree(points[first].numpy()).query_pairs(gap, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(first), len(first)))
-    label = connected_components(links, directed=False)[1][group.numpy()]
+    label = number_components(pairs, len(first))[group.numpy()]
     order = np.argsort(np.argsort(-np.bincount(label), kind="stable"), kind="stable")
     return torch.from_numpy(order[label]).to(device)
 

@@ -32,6 +32,15 @@ def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[
     return first, torch.linalg.cross(normal, first)
 
 
+def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Return the number, from 0, of the connected component of each of `count` nodes, given (e, 2) pairs of nodes."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(links, directed=False)[1]
+
+
 def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:
     """Return n unit vectors spread over the sphere, from +z to -z; vector k has the azimuth `angle` * (k + `start`)."""
     k = torch.arange(n, dtype=torch.float64)

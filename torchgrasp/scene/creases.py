@@ -5,6 +5,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchgrasp.geometry.linalg import number_components
 from torchgrasp.scene.image import DepthImage
 
 REACH = 0.012  # distance [m] on either side of a crease over which its angle is measured
@@ -20,8 +21,7 @@ def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h
     from scipy.ndimage import find_objects
 
     least = 300 * pieces.numel() / (640 * 480)  # pixels of the smallest part
-    points = np.einsum("ij,hwj->hwi", image.obj_from_camera[:3, :3].T.numpy(), image.points().numpy())
-    points -= image.obj_from_camera[:3, :3].T.numpy() @ image.obj_from_camera[:3, 3].numpy()  # in the camera's frame
+    points = (image.points() - image.obj_from_camera[:3, 3]).numpy()  # from the camera, so that normals can face it
     parts, last = pieces.clone(), int(pieces.max())
     names, count = pieces[pieces > 0].unique(return_counts=True)
     numbers = torch.zeros(last + 1, dtype=torch.int32)
@@ -83,15 +83,9 @@ def _normals(points: np.ndarray, mask: np.ndarray, step: int) -> tuple[np.ndarra
 
 def _join_parts(parts: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return each pixel's part after parts that do not meet at a concave angle are joined; numbers start from 1."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    count = int(parts.max())
     joined = [(a, b) for a, b in _borders(parts) if not _is_concave(parts, points, a, b)]
-    pairs = np.array(joined, dtype=np.int64).reshape(-1, 2) - 1
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(count, count))
-    names = np.concatenate([[0], connected_components(graph, directed=False)[1] + 1])
-    return names[parts]
+    pairs = np.array(joined, dtype=np.int64).reshape(-1, 2)
+    return number_components(pairs, int(parts.max()) + 1)[parts]
 
 
 def _borders(parts: np.ndarray) -> list[tuple[int, int]]:

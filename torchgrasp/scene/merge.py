@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.cloud.parts import label_bodies
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
@@ -30,11 +31,11 @@ def merge_pieces(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, ju
     from scipy.spatial import KDTree
 
     new, whole = torch.zeros(int(pieces.max()) + 1, dtype=torch.long), torch.bincount(pieces.reshape(-1))
+    if len(whole) == 1:
+        return new
     floating = _floating(image, pieces, table, jump)
     thin = _thinned(image, pieces, whole)
     names, count = thin[thin > 0].unique(return_counts=True)
-    if not len(names):
-        return new
     order = torch.argsort(thin[thin > 0], stable=True)
     parts = _over_table(image, table)[thin > 0][order].split(count.tolist())
     gap = _gaps([KDTree(part.numpy()) for part in parts])
@@ -50,8 +51,7 @@ def merge_pieces(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, ju
 
 def _thinned(image: DepthImage, pieces: Int[Tensor, "h w"], count: Int[Tensor, "k"]) -> Int[Tensor, "h w"]:
     """Return the piece numbers at pixels 1.5 mm apart, 0 between them; small pieces keep their number everywhere."""
-    away = float(image.depth[pieces > 0].median()) if bool((pieces > 0).any()) else 1.0
-    step = max(1, int(0.0015 * float(image.intrinsics[0, 0]) / away))
+    step = max(1, int(0.0015 * float(image.intrinsics[0, 0]) / float(image.depth[pieces > 0].median())))
     kept = (count < 3000)[pieces]
     kept[::step, ::step] = True
     return torch.where(kept, pieces, 0)
@@ -62,8 +62,10 @@ def find_touching(image: DepthImage, labels: Int[Tensor, "h w"]) -> list[tuple[i
     from scipy.spatial import KDTree
 
     names, points = labels[labels > 0].unique().tolist(), image.points()
+    if len(names) < 2:
+        return []
     labels = _thinned(image, labels, torch.bincount(labels.reshape(-1)))
-    gap = _gaps([KDTree(points[labels == k].numpy()) for k in names]) if len(names) > 1 else np.empty((0, 0))
+    gap = _gaps([KDTree(points[labels == k].numpy()) for k in names])
     return [(names[a], names[b]) for a, b in itertools.combinations(range(len(gap)), 2) if gap[a, b] < 0.5 * GAP]
 
 
@@ -112,13 +114,7 @@ def _gaps(trees: list[Any]) -> np.ndarray:
 
 def _ends(points: np.ndarray) -> int:
     """Return the number of separate clusters of points: a handle or a rim meets its body at two ends."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
-    pairs = KDTree(points).query_pairs(0.015, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(len(points), len(points)))
-    return int((np.bincount(connected_components(graph, directed=False)[1]) >= 6).sum())
+    return int((torch.bincount(label_bodies(torch.from_numpy(points), gap=0.015)) >= 6).sum())
 
 
 class _Body:
@@ -128,6 +124,10 @@ class _Body:
         self.rows, self.count, self.points = rows, count, points[:: 1 + len(points) // 2000]
         self.hull = Hull.of(points[:, :2])
         self.foot, self.top = self.points[:, 2].quantile(torch.tensor([0.02, 0.98], dtype=points.dtype)).tolist()
+
+    def share_over(self, other: "_Body") -> float:
+        """Return the share of the points that are over the footprint of another body."""
+        return float(other.hull.holds(self.points[:, :2]).double().mean())
 
     def __add__(self, other: "_Body") -> "_Body":
         return _Body(self.rows + other.rows, torch.cat([self.points, other.points]), self.count + other.count)
@@ -143,7 +143,7 @@ def _one_body(a: _Body, b: _Body, gap: float) -> bool:
     if gap == 0.0 or gap > FAR:
         return gap == 0.0
     small, large = (a, b) if a.count < b.count else (b, a)
-    over = float(large.hull.holds(small.points[:, :2]).double().mean())
+    over = small.share_over(large)
     if not _apart(small, large, over) and (gap < GAP or over > NESTED):
         return True
     hull = Hull.of(torch.cat([a.hull.corners, b.hull.corners]))
@@ -164,9 +164,8 @@ def _apart(small: _Body, large: _Body, over: float) -> bool:
 
 def _upon(small: _Body, large: _Body) -> bool:
     """Return whether a body is an object that lies upon another one: a lid or a knob is smaller."""
-    over = float(large.hull.holds(small.points[:, :2]).double().mean())
     higher = small.top > large.top + 0.01 and small.foot > 0.5 * large.top
-    return over > 0.5 and higher and small.count > 0.1 * large.count
+    return higher and small.count > 0.1 * large.count and small.share_over(large) > 0.5
 
 
 def _floating(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:

@@ -119,12 +119,13 @@ def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int
 def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 6"]:
     """Return the features from which the model estimates whether points [m] in the shadow of an object are full.
 
-    They are, in order:
+    The features are, in order:
 
-    * the depth of the point behind the object's surface, over the object's width,
-    * the depth [m] of the point below the object's visible points in the same vertical column,
-    * how far [m] the mirrored point is behind the measured depth, for two guesses of the object's middle,
-    * the point's distance from the object's front, over the object's visible depth; from its middle, over its width.
+    * The depth of the point behind the object's surface, over the object's width.
+    * The depth [m] of the point below the object's visible points in the same vertical column.
+    * Two distances [m] of the mirrored point behind the measured depth, for two guesses of the object's middle.
+    * The point's distance from the object's front, over the object's visible depth.
+    * The point's distance from the object's middle, over the object's width.
     """
     from scipy.ndimage import maximum_filter
 

@@ -6,6 +6,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchgrasp.cloud.sensor import fit_noise
+from torchgrasp.geometry.linalg import number_components
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support
 from torchgrasp.scene.creases import cut_creases
@@ -52,7 +53,8 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     group = merge_pieces(smooth, torch.where(sure, pieces, 0), table, jump)
     whole = _numbered(_filled(group[pieces], measured, table.height(points)))
     small = torch.nonzero(count_labels(whole) < 500 * whole.numel() / (640 * 480))[:, 0].tolist()
-    noisy = [k for k in small if k > 0 and _is_noise(whole, k, image, mean / noise)]
+    pixel = image.depth / float(image.intrinsics[0, 0])
+    noisy = [k for k in small if k > 0 and _is_noise(whole, k, points, pixel, mean / noise)]
     return _numbered(torch.where(torch.isin(whole, torch.tensor(noisy, dtype=whole.dtype)), 0, whole))
 
 
@@ -96,9 +98,6 @@ def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
 
 def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]:
     """Return the number, from 1, of each pixel's connected component in the mask `core`; 0 outside of the mask."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     h, w = core.shape
     index = torch.arange(h * w).reshape(h, w)
     edges = []
@@ -107,9 +106,7 @@ def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]
         b = (slice(down, h), slice(max(0, right), w - max(0, -right)))
         joined = core[a] & core[b] & ((depth[a] - depth[b]).abs() < jump[a])
         edges.append(torch.stack([index[a][joined], index[b][joined]]))
-    pairs = torch.cat(edges, 1).numpy()
-    graph = coo_matrix((np.ones(pairs.shape[1], dtype=bool), tuple(pairs)), shape=(h * w, h * w))
-    number = torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64))
+    number = torch.from_numpy(number_components(torch.cat(edges, 1).T.numpy(), h * w).astype(np.int64))
     return torch.where(core, number.reshape(h, w) + 1, 0)
 
 
@@ -167,13 +164,14 @@ def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
     return new[labels]
 
 
-def _is_noise(labels: Int[Tensor, "h w"], k: int, image: DepthImage, deviations: Tensor) -> bool:
+def _is_noise(labels: Int[Tensor, "h w"], k: int, points: Tensor, pixel: Tensor, deviations: Tensor) -> bool:
     """Return whether a small object is an uneven place of the table, or a fringe of a body ten times as large.
 
     Args:
         labels: labels of the objects.
         k: label of the small object.
-        image: the depth image of the objects.
+        points: the point of each pixel [m], (h, w, 3).
+        pixel: the width of each pixel on its surface [m], (h, w).
         deviations: height of each pixel above the table, over the standard deviation of the noise, (h, w).
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt
@@ -182,9 +180,9 @@ def _is_noise(labels: Int[Tensor, "h w"], k: int, image: DepthImage, deviations:
     if float((deviations[mine] > 8).double().mean()) < 0.25:
         return True
     rows, columns = (slice(max(0, int(side.min()) - 4), int(side.max()) + 5) for side in torch.nonzero(mine).T)
-    mine, near, points = mine[rows, columns], labels[rows, columns], image.points()[rows, columns]
-    pixel = image.depth[labels == k].median() / image.intrinsics[0, 0]
-    if float(np.max(np.asarray(distance_transform_edt(mine.numpy())))) * float(pixel) > 0.005:
+    width, mine = float(pixel[mine].median()), mine[rows, columns]
+    near, points = labels[rows, columns], points[rows, columns]
+    if width * float(np.max(np.asarray(distance_transform_edt(mine.numpy())))) > 0.005:
         return False
     around = torch.from_numpy(binary_dilation(mine.numpy(), iterations=4)) & (near > 0) & ~mine
     around &= count_labels(labels)[near] > 10 * int(mine.sum())

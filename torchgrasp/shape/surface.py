@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgrasp.base import Value, map_tensors
 from torchgrasp.checks import Range, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.linalg import Points, limit_norm, unit
+from torchgrasp.geometry.linalg import Points, limit_norm, number_components, unit
 from torchgrasp.geometry.mesh import clip_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, SignedDistanceField, field_from_surface
 from torchgrasp.shape.gp import ShapeGP
@@ -171,13 +171,9 @@ def newton_step(value: Float[Tensor, "n"], gradient: Points, longest: float, lea
 
 def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
     """Return a mask of the faces in connected pieces to which enough points of the cloud are nearest."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(corners), len(corners)))
-    _, label = connected_components(graph, directed=False)
+    label = number_components(np.concatenate([faces[:, :2], faces[:, 1:]]), len(corners))
     cloud = shape.normalise(shape.cloud.points.to(shape.x)).cpu().numpy()
     _, nearest = KDTree(corners).query(cloud)
     share = np.bincount(label[nearest], minlength=label.max() + 1) / len(cloud)

@@ -62,8 +62,8 @@ class Grasp(Command):
 
     Writes grasps.safetensors, report.html and the 3D page view.html into the output folder. If no grasp is executable,
     one setting at a time is changed, and the change that helps most is named. The cloud is checked as by `cloud check`.
-    It is refused if the camera is below the table or contradicts the points, if the table or another plane was not
-    removed from it, if there are two bodies, or if the unit is wrong. Other findings are printed as advice.
+    It is refused if the camera is below the table or contradicts the points, or if the unit is wrong. A cloud with two
+    bodies, with the table or with another plane is refused, too. Other findings are printed as advice.
     """
 
     cloud: Path = positional(
