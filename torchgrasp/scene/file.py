@@ -62,8 +62,7 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
     path = Path(path)
     if path.suffix.lower() != ".npz":
         raise BadArgument("path", path, "a file ending in .npz")
-    labels = np.zeros(scene.image.depth.shape, dtype=np.int32)
-    labels[tuple(scene.pixels.cpu().numpy().T)] = scene.labels.cpu().numpy()
+    labels = scene.pixel_labels.cpu().numpy().astype(np.int32)
     arrays = {
         "depth": scene.image.depth.cpu().numpy().astype(np.float32),
         "intrinsics": scene.image.intrinsics.cpu().numpy(),

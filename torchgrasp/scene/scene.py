@@ -215,8 +215,7 @@ class Scene(Value):
             f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
             for plane in self.others
         ]
-        labels = torch.zeros(self.image.depth.shape, dtype=torch.long)
-        labels[self.pixels[:, 0], self.pixels[:, 1]] = self.labels
+        labels = self.pixel_labels
         for a, b in find_touching(self.image, labels):
             if a in self.given and b in self.given:
                 continue
@@ -231,6 +230,13 @@ class Scene(Value):
                 "the target is cut off at the border of the image: its other part is unknown; turn the camera to it"
             )
         return tuple(found)
+
+    @property
+    def pixel_labels(self) -> Int[Tensor, "h w"]:
+        """The label of each pixel of the image; 0 where nothing was measured, too."""
+        labels = self.labels.new_zeros(self.image.depth.shape)
+        labels[self.pixels[:, 0], self.pixels[:, 1]] = self.labels
+        return labels
 
     @property
     def supports(self) -> tuple[Plane, ...]:

@@ -5,8 +5,6 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import torch
-
 from torchgrasp.app.cli.command import Command, Progress, arguments, naming, nested, option, positional
 from torchgrasp.app.cli.inputs import (
     CLOUD_HELP,
@@ -211,9 +209,8 @@ class Grasp(Command):
         image, name = scene.image, "--up" if self.view.table is None else "--table"
         table = None if self.view.table is None else self.view.plane(PointCloud(scene.points))
         supports = find_plausible(scene.points, image.obj_from_camera, table, self.view.vertical, known_unit=True)
-        labels, place = torch.zeros(image.depth.shape, dtype=torch.long), tuple(scene.pixels.T)
-        labels[place] = scene.labels
-        labels = label_again(image, scene.table, supports[0], labels, scene.given, scene.target or 0)[place]
+        labels = label_again(image, scene.table, supports[0], scene.pixel_labels, scene.given, scene.target or 0)
+        labels = labels[tuple(scene.pixels.T)]
         planes, target = tuple(support.plane for support in supports), None if chosen else scene.target
         again = dataclasses.replace(scene, labels=labels, table=planes[0], others=planes[1:], target=target)
         if not again.things or target not in (None, *again.things):

@@ -69,8 +69,7 @@ def encode_scene(scene: Scene) -> bytes:
 
 def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
     """Return each pixel's index in `KINDS` and its object's label. The index counts only where the label is 0."""
-    image, labels = scene.image, np.zeros(scene.image.depth.shape, dtype=int)
-    labels[tuple(scene.pixels.cpu().numpy().T)] = scene.labels.cpu().numpy()
+    image, labels = scene.image, scene.pixel_labels.cpu().numpy()
     points, measured = image.points(), image.depth.numpy() > 0
     kinds = measured.astype(int)
     near = 3 * assume_noise(points.reshape(-1, 3), scene.viewpoint).reshape(labels.shape).numpy()
