@@ -30,7 +30,8 @@ from torchgrasp.errors import BadArgument
 # isort: off
 from torchgrasp.marks import (  # noqa: F401
     ANY, DTYPES, FINITE, LEAST, MOST, NUMBERS, RIGID, Count, Fraction, Length, Measured, Pose, Poses, Positive,
-    Range, Rows, Seed, check_dense, check_moved, check_path, describe, fits, is_rigid, is_tensor, show,
+    Range, Rows, Seed, check_dense, check_moved, check_path, describe, fits, is_known, is_rigid, is_tensor, is_tracked,
+    show,
 )  # fmt: skip
 # isort: on
 
@@ -56,7 +57,7 @@ class _Call:
             (self.rigid, is_rigid, RIGID),
         ):
             for name, x in tensors.items():
-                if not bool((good := test(x)).all()):
+                if is_known(x) and not bool((good := test(x)).all()):
                     first = tuple(torch.nonzero(~good)[0].tolist())
                     place = f" at index {list(first)}" if first else ""
                     raise BadArgument(name, f"{x[first].tolist()}{place}", allowed)
@@ -71,7 +72,9 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
 
     NumPy numbers become Python numbers. If an argument is a value, its fields are checked again. In a method, a letter
     in a shape has the same size as in the fields of the object. A value without `__post_init__` that the library makes
-    from tensors is not checked. Tensors that require a gradient are refused unless `gradients` is True.
+    from tensors is not checked. With `gradients` True, the function is differentiable: it takes tensors that require a
+    gradient, dual tensors and tensors inside a transform of torch.func. All other functions refuse these tensors.
+    Numbers inside torch.vmap and arguments inside torch.compile are not checked.
 
     Raises:
         BadArgument: in a call, an argument has a wrong type, shape, dtype or range, or a number that is not finite.
@@ -93,6 +96,8 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
+        if gradients and torch.compiler.is_compiling():  # a compiler traces the function, not the checks
+            return function(*args, **kwargs)
         inside = getattr(_thread, "inside", False)
         if inside and not always():
             return function(*args, **kwargs)

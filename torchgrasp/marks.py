@@ -11,6 +11,8 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from jaxtyping import AbstractArray, Bool, Float
 from torch import Tensor
+from torch._C import _functorch as functorch  # pyright: ignore[reportAttributeAccessIssue]
+from torch.autograd import forward_ad
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.limits import NAME_BYTES, PATH_BYTES, SHOWN_LETTERS
@@ -104,14 +106,37 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
 
 
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
-    """Raise `BadArgument` if a tensor is sparse, nested or meta, or needs a gradient while `gradients` is false."""
+    """Raise `BadArgument` if a tensor is sparse, nested or meta, or transformed by torch while `gradients` is false."""
     if value.layout is not torch.strided or value.is_nested or value.is_meta:
         found = "no numbers (meta)" if value.is_meta else f"a layout of {value.layout}"
         raise BadArgument(name, found, "a dense tensor with numbers")
     if value.is_neg():
         raise BadArgument(name, "a tensor with the negative bit", f"one without: {name}.resolve_neg()")
-    if value.requires_grad and not gradients:
+    if is_tracked(value) and not gradients:
         raise BadArgument(name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()")
+    if not (is_known(value) or gradients):
+        raise BadArgument(name, "a tensor inside torch.vmap", "a plain tensor: the function is not differentiable")
+
+
+def _levels(value: Tensor) -> list[Tensor]:
+    """Return a tensor and the tensors that it wraps, one for each transform of torch.func around the call."""
+    levels = [value]
+    while functorch.is_functorch_wrapped_tensor(levels[-1]):
+        levels.append(functorch.get_unwrapped(levels[-1]))
+    return levels
+
+
+def is_tracked(value: Tensor) -> bool:
+    """Return whether derivatives are taken by a tensor: by autograd, in forward mode, or by torch.func."""
+    levels = _levels(value)
+    if any(x.requires_grad or functorch.is_gradtrackingtensor(x) for x in levels):
+        return True
+    return not functorch.is_batchedtensor(value) and forward_ad.unpack_dual(value).tangent is not None
+
+
+def is_known(value: Tensor) -> bool:
+    """Return whether Python may test the numbers of a tensor: not inside torch.vmap."""
+    return not any(map(functorch.is_batchedtensor, _levels(value)))
 
 
 def show(value: Any) -> str:

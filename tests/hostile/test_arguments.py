@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 import torchgrasp
 from tests.hostile.arguments import HOSTILE, behind, checked_things, methods_of, public, required, wrong_arguments
@@ -75,3 +76,29 @@ def test_a_method_takes_its_value_by_name():
     shape = torchgrasp.fit_shape(torchgrasp.load_object("jug").view)
     points = shape.cloud.points[:2]
     assert torch.equal(type(shape).normalise(self=shape, points=points), shape.normalise(points))
+
+
+def dual(function, x):
+    with forward_ad.dual_level():
+        return function(forward_ad.make_dual(x, x))
+
+
+@pytest.mark.promise("I7")
+@pytest.mark.parametrize(
+    ("transform", "found"),
+    [
+        (lambda f, x: f(x.clone().requires_grad_()), "a gradient"),
+        (lambda f, x: torch.func.grad(f)(x), "a gradient"),
+        (lambda f, x: torch.func.jacfwd(f)(x), "a gradient"),
+        (lambda f, x: torch.vmap(torch.func.grad(f))(x[None]), "a gradient"),
+        (lambda f, x: torch.vmap(f)(x[None]), "inside torch.vmap"),
+        (dual, "a gradient"),
+    ],
+)
+def test_transformed_tensors_are_refused_where_nothing_is_differentiable(transform, found):
+    def margin(points):
+        return torchgrasp.closure_probability(shape, torchgrasp.Contacts(points, points)).sum()
+
+    shape = torchgrasp.fit_shape(torchgrasp.load_object("jug").view)
+    with pytest.raises(BadArgument, match=f"contacts.points: .*{found}"):
+        transform(margin, torch.eye(3)[None])
