@@ -114,7 +114,7 @@ def check_dense(name: str, value: Tensor, gradients: bool) -> None:
         raise BadArgument(name, "a tensor with the negative bit", f"one without: {name}.resolve_neg()")
     if is_tracked(value) and not gradients:
         raise BadArgument(name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()")
-    if not (is_known(value) or gradients):
+    if not (gradients or is_known(value) or torch.compiler.is_compiling()):
         raise BadArgument(name, "a tensor inside torch.vmap", "a plain tensor: the function is not differentiable")
 
 
@@ -135,8 +135,8 @@ def is_tracked(value: Tensor) -> bool:
 
 
 def is_known(value: Tensor) -> bool:
-    """Return whether Python may test the numbers of a tensor: not inside torch.vmap."""
-    return not any(map(functorch.is_batchedtensor, _levels(value)))
+    """Return whether Python may test the numbers of a tensor: not inside torch.vmap or torch.compile."""
+    return not (torch.compiler.is_compiling() or any(map(functorch.is_batchedtensor, _levels(value))))
 
 
 def show(value: Any) -> str:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchgrasp.errors import DegenerateContacts
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.marks import is_known
 
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
@@ -94,11 +95,15 @@ def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
     The origin is the centroid of the contacts (Eq. 16). The x axis points from the first contact to the third. The z
     axis is the normal of their plane.
 
+    Inside torch.vmap, where numbers are unknown, contacts that lie nearly on a line give NaN.
+
     Raises:
         DegenerateContacts: the contacts lie nearly on a line.
     """
     flat = degenerate(points)
-    if bool(flat.any()):
+    if not is_known(flat):
+        points = torch.where(flat[..., None, None], torch.nan, points)
+    elif bool(flat.any()):
         raise DegenerateContacts(f"{int(flat.sum())} of {flat.numel()} contact triples lie on a line or in a point")
     p1, p2, p3 = points.unbind(-2)
     x_axis = unit(p3 - p1)

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.marks import is_known
 
 Points = Float[Tensor, "n 3"]
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # golden section of the full circle [rad]
@@ -65,8 +66,11 @@ def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tens
     """Return the lower Cholesky factor of a matrix, without added jitter.
 
     An indefinite matrix raises `IndefiniteCovariance`; its message names the matrix by `what` and suggests the `fix`.
+    Inside torch.vmap, where numbers are unknown, its factor is NaN.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
+    if not is_known(matrix):
+        return torch.where((info == 0)[..., None, None], factor, torch.nan)
     if not bool((info == 0).all() & torch.isfinite(factor).all()):  # one wait for the device
         finite = bool(torch.isfinite(matrix).all())
         smallest = float(torch.linalg.eigvalsh(matrix).min()) if finite else float("nan")

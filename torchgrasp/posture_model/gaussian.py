@@ -1,27 +1,45 @@
 """A Gaussian mixture over named dimensions: density, samples, marginals and conditionals (Eqs. 19-20)."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch._C._functorch import peek_interpreter_stack
 
 from torchgrasp.base import Value
-from torchgrasp.checks import Range, Seed, checked
+from torchgrasp.checks import Range, Seed, check_dense, checked, is_known, is_tracked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import cholesky
 
 ROWS_PER_CHUNK = 8192  # rows evaluated together: this bounds the memory for rows x components x dimensions
+Kept = TypeVar("Kept")
+
+
+def kept(compute: Callable[[Any], Kept]) -> Kept:
+    """Return a property of a mixture: computed once, but anew in a transform or if derivatives by it are taken."""
+    name = f"_{compute.__name__}_kept"
+
+    def get(mixture: Any) -> Any:
+        if torch.compiler.is_compiling() or peek_interpreter_stack() is not None or mixture._is_free:
+            return compute(mixture)  # a tensor made inside a transform of torch.func is of no use outside
+        if name not in mixture.__dict__:
+            with torch.inference_mode(False):  # the result may be used outside of the caller's inference mode
+                mixture.__dict__[name] = compute(mixture)
+        return mixture.__dict__[name]
+
+    return property(get, doc=compute.__doc__)  # pyright: ignore[reportReturnType]
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GaussianMixture(Value):
     """A mixture of m Gaussians over d named dimensions (Eqs. 19-20), evaluated in float64.
+
+    Densities are differentiable, to any order, in the points and in `weights`, `means` and `covariances`.
 
     Raises:
         BadArgument: inconsistent shapes, weights that are negative or do not sum to 1, an indefinite or asymmetric
@@ -40,24 +58,36 @@ class GaussianMixture(Value):
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        m, d = len(self.weights), len(self.names)
+        d = len(self.names)
         if self.means.shape[1] != d:
             raise BadArgument("names", f"{d} names of {self.means.shape[1]} dimensions", "one for each")
-        if m < 1 or not bool((self.weights >= 0).all()) or abs(float(self.weights.double().sum()) - 1) > 1e-6:
-            found = f"{m} weights, the least {self.weights.min() if m else None} and sum {float(self.weights.sum())}"
-            raise BadArgument("weights", found, "at least one, none negative, of sum 1 within 1e-6")
         if d < 1 or len(set(self.names)) < d:
             raise BadArgument("names", self.names, "at least one, each once")
-        scale = self.covariances.diagonal(dim1=-2, dim2=-1).abs().sqrt()
-        skewness = (self.covariances - self.covariances.mT).abs()
+        self._check_numbers(self.weights.detach(), self.covariances.detach())
+
+    def _check_numbers(self, weights: Float[Tensor, "m"], covariances: Float[Tensor, "m d d"]) -> None:
+        """Raise `BadArgument` for weights that are none, and for an indefinite matrix, where numbers are known."""
+        m = len(weights)
+        if m < 1 or (is_known(weights) and not (bool((weights >= 0).all()) and abs(_sum(weights) - 1) <= 1e-6)):
+            found = f"{m} weights, the least {weights.min() if m else None} and sum {_sum(weights)}"
+            raise BadArgument("weights", found, "at least one, none negative, of sum 1 within 1e-6")
+        if not is_known(covariances):
+            return
+        scale = covariances.diagonal(dim1=-2, dim2=-1).abs().sqrt()
+        skewness = (covariances - covariances.mT).abs()
         if bool((skewness > 1e-6 * scale[:, :, None] * scale[:, None, :]).any()):
             raise BadArgument("covariances", "an asymmetric matrix", "symmetric positive definite matrices")
-        info = torch.linalg.cholesky_ex(self.covariances.double()).info
+        info = torch.linalg.cholesky_ex(covariances.double()).info
         if bool((info != 0).any()):
             found = f"an indefinite matrix in component {int(info.nonzero()[0])}"
             raise BadArgument("covariances", found, "symmetric positive definite matrices")
 
-    @checked
+    @property
+    def _is_free(self) -> bool:
+        """Whether derivatives are taken by a parameter: an optimiser may change it between two calls."""
+        return any(map(is_tracked, (self.weights, self.means, self.covariances)))
+
+    @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
         """Return the log-density of each row, Eq. (19); raises `BadArgument` for rows that do not have d numbers."""
         if x.ndim < 1 or x.shape[-1] != len(self.names):
@@ -71,37 +101,43 @@ class GaussianMixture(Value):
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
-        """Draw n random samples, one in each row; raises `BadArgument` for n or seed out of range."""
+        """Draw n random samples, one in each row; raises `BadArgument` for n or seed out of range.
+
+        Samples are not differentiable: parameters that require a gradient are refused.
+        """
+        for name in ("weights", "means", "covariances"):
+            check_dense(name, getattr(self, name), gradients=False)
         generator = torch.Generator().manual_seed(seed)
         weights, means = self.weights.double().cpu(), self.means.double().cpu()
-        draw = torch.rand(n, generator=generator, dtype=torch.float64)
+        draw = torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")
         # By rounding the sum of the weights may lie below a draw, which then belongs to the last component.
         component = torch.searchsorted(weights.cumsum(0), draw, right=True).clamp(max=len(weights) - 1)
-        noise = torch.randn(n, len(self.names), generator=generator, dtype=torch.float64)
+        noise = torch.randn(n, len(self.names), generator=generator, dtype=torch.float64, device="cpu")
         factor = torch.linalg.cholesky(self.covariances.double().cpu())
         rows = means[component]
         for k in range(len(weights)):
             rows[component == k] += noise[component == k] @ factor[k].T
         return rows.to(self.means.device)
 
-    @checked
+    @checked(gradients=True)
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
         """Return the marginal mixture of the named dimensions, Eq. (22); raises `BadArgument` for an unknown name."""
         index = self._index(names)
         block = self.covariances.double()[:, index][:, :, index]
         return GaussianMixture(self.weights.double(), self.means.double()[:, index], block, tuple(names))
 
-    @checked
+    @checked(gradients=True)
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
         """Return the mixture of the other dimensions, given the values of some by name, Eq. (23) of the paper.
 
-        Components of weight 0 are left out. Raises `BadArgument` for unknown names or non-finite values.
+        Components of weight 0 are left out, except inside torch.vmap. Raises `BadArgument` for unknown names or
+        non-finite values.
         """
         observed = self._index(tuple(given))
         rest = [i for i in range(len(self.names)) if i not in observed]
         if not rest:
             raise BadArgument("given", "every dimension", "some of them")
-        values = self.means.new_tensor(list(given.values()), dtype=torch.float64)
+        values = torch.tensor(list(given.values()), dtype=torch.float64, device=self.means.device)
         if not given:
             return self.marginal(self.names)
         part = self.marginal(tuple(given))
@@ -112,8 +148,10 @@ class GaussianMixture(Value):
         means = means[:, rest] + (cross @ offset)[..., 0]
         covariances = covariances[:, rest][:, :, rest] - cross @ cross.transpose(-1, -2)
         covariances = (covariances + covariances.transpose(-1, -2)) / 2
-        possible, names = weights > 0, tuple(self.names[i] for i in rest)
-        return GaussianMixture(weights[possible], means[possible], covariances[possible], names)
+        names = tuple(self.names[i] for i in rest)
+        if is_known(weights):
+            weights, means, covariances = (x[weights > 0] for x in (weights, means, covariances))
+        return GaussianMixture(weights, means, covariances, names)
 
     def mean(self) -> Float[Tensor, "d"]:
         """Return the expected value of every dimension."""
@@ -125,7 +163,7 @@ class GaussianMixture(Value):
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
         return within + torch.einsum("m,mi,mj->ij", self.weights.double(), offset, offset)
 
-    @functools.cached_property
+    @kept
     def whitening(self) -> "Whitening":
         """Each component's whitening matrix, whitened mean and log scale, which make densities quick to evaluate."""
         means, d, matrix = self.means.double(), len(self.names), whitening_matrices(self.covariances.double())
@@ -137,6 +175,10 @@ class GaussianMixture(Value):
         if unknown or len(set(names)) < len(names):
             raise BadArgument("names", unknown or tuple(names), f"some of {', '.join(self.names)}, each once")
         return [self.names.index(name) for name in names]
+
+
+def _sum(weights: Float[Tensor, "m"]) -> float:
+    return float(weights.double().sum())
 
 
 @dataclasses.dataclass(frozen=True)

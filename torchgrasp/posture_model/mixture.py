@@ -1,8 +1,8 @@
 """The learned posture model of a hand: a Gaussian mixture over joints and contact codes (Eqs. 15-23)."""
 
 import dataclasses
-import functools
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -11,13 +11,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import check_whole
-from torchgrasp.checks import ANY, Count, check_tensor, checked
+from torchgrasp.checks import ANY, Count, check_tensor, checked, is_known
 from torchgrasp.errors import BadArgument, ModelFileError, Status
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.geometry.frames import degenerate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand
-from torchgrasp.posture_model.gaussian import GaussianMixture, map_rows
+from torchgrasp.posture_model.gaussian import GaussianMixture, kept, map_rows
 from torchgrasp.values import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
@@ -40,12 +40,12 @@ def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*
     return torch.cat([lengths, cosines], dim=-1)
 
 
-@checked
+@checked(gradients=True)
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     """Return the codes of contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
 
     A code is three lengths [m] and three cosines, which no rigid motion changes. Points [m] and unit normals have shape
-    (b, 3, 3). Contacts on a line give NaN and `Status.DEGENERATE`.
+    (b, 3, 3). Contacts on a line give NaN and `Status.DEGENERATE`. Codes and frames are differentiable in both.
 
     Raises:
         BadArgument: wrong shapes, non-finite numbers, or normals whose length is not 1 within 1e-3.
@@ -57,7 +57,7 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     check_tensor("points", points, (None, 3, 3))
     check_tensor("normals", normals, (len(points), 3, 3))
     lengths = torch.linalg.vector_norm(normals, dim=-1)
-    if bool(((lengths - 1).abs() > 1e-3).any()):
+    if is_known(lengths) and bool(((lengths - 1).abs() > 1e-3).any()):
         worst = lengths.flatten()[(lengths - 1).abs().argmax()].item()
         raise BadArgument("normals", f"a normal of length {worst:.6g}", "unit vectors")
     order = torch.tensor(PERMUTATIONS, device=points.device)
@@ -65,10 +65,10 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     flat = degenerate(ordered_points).any(1)  # in any order: at the threshold rounding may distinguish them
     bad = flat[:, None, None]
     # A degenerate row gets another triangle, so that one call frames all rows.
-    frames = virtual_frame(torch.where(bad[..., None], torch.eye(3).to(points), ordered_points))
+    ordered_points = torch.where(bad[..., None], torch.eye(3).to(points), ordered_points)
     return ContactCode(
         q=torch.where(bad, torch.nan, encode_fingertips(ordered_points, ordered_normals)),
-        obj_from_vf=torch.where(bad[..., None], torch.nan, frames),
+        obj_from_vf=torch.where(bad[..., None], torch.nan, virtual_frame(ordered_points)),
         status=torch.where(flat, int(Status.DEGENERATE), int(Status.OK)),
         permutation=order,
     )
@@ -137,49 +137,52 @@ class GraspMixture(GaussianMixture):
         """Names of the joints, in the order of the hand."""
         return self.names[:-6]
 
-    @functools.cached_property
+    @kept
     def _code(self) -> GaussianMixture:
         """The mixture over the contact code alone, without the joints, Eq. (22) of the paper."""
         return self.marginal(CODE_NAMES)
 
-    @functools.cached_property
+    @kept
     def _regression(self) -> Float[Tensor, "m h 6"]:
         """The slope of each component's mean joints over the contact code: Sigma_(Theta,q) Sigma_q^-1 in Eq. (23)."""
         whitening = self._code.whitening.matrix
         return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
 
-    @functools.cached_property
+    @kept
     def _stacked_regression(self) -> Float[Tensor, "k h"]:
         """Matrices, stacked over components, that multiply (q, 1) to give each component's mean joints at a code q."""
-        at_zero = self.means[:, :-6].double() - (self._regression @ self.means[:, -6:, None].double())[..., 0]
-        return torch.cat([self._regression.transpose(1, 2), at_zero[:, None]], 1).flatten(0, 1)
+        slope = self._regression
+        at_zero = self.means[:, :-6].double() - (slope @ self.means[:, -6:, None].double())[..., 0]
+        return torch.cat([slope.transpose(1, 2), at_zero[:, None]], 1).flatten(0, 1)
 
-    @checked
+    @checked(gradients=True)
     def energy(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b"]:
         """Return half the squared Mahalanobis distance of each code from the nearest component, min f_i of Eq. (21).
 
         The hand probably reaches a code if this value is below `DEFAULT_ENERGY`, or the paper's `PAPER_ENERGY`. A code
-        with NaN gives NaN.
+        that is not finite gives NaN. Where two components are equally near, the derivative is the mean of theirs.
         """
-        return map_rows(lambda q: 0.5 * self._code.whitening.squared(q).amin(-1), _codes(code))
+        whitening = self._code.whitening
+        return _map_codes(lambda q: 0.5 * whitening.squared(q).amin(-1), code)
 
-    @checked
+    @checked(gradients=True)
     def joints(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b h"]:
         """Return the expected joint positions [rad] given each contact code, Eq. (23) of the paper.
 
         The code describes a contact set by three lengths [m] and three cosines. The joints may exceed their limits. A
-        code with NaN gives NaN.
+        code that is not finite gives NaN.
         """
+        codes, regression = self._code, self._stacked_regression
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
             # sum_i h_i A_i (q, 1) as one matrix product
             extended = torch.cat([q, torch.ones_like(q[:, :1])], 1)
-            weighted = self._log_responsibility(q).exp()[:, :, None] * extended[:, None]
-            return weighted.flatten(1) @ self._stacked_regression
+            weighted = torch.softmax(codes.log_joint(q), -1)[:, :, None] * extended[:, None]
+            return weighted.flatten(1) @ regression
 
-        return map_rows(expect, _codes(code))
+        return _map_codes(expect, code)
 
-    @checked
+    @checked(gradients=True)
     def modes(
         self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
     ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
@@ -190,21 +193,18 @@ class GraspMixture(GaussianMixture):
         Raises `BadArgument` for k outside [1, m].
         """
         check_whole("k", k, 1, len(self.weights))
+        codes, regression = self._code, self._regression
 
         def take(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n k d"]:
-            top = self._log_responsibility(q).topk(k, dim=-1)
+            top = torch.log_softmax(codes.log_joint(q), -1).topk(k, dim=-1)  # free of underflow
             # the bracket of Eq. (23), the mean of the joints given the code in each component
             difference = q[:, None] - self.means[:, -6:].double()
-            means = self.means[:, :-6].double() + torch.einsum("mhc,nmc->nmh", self._regression, difference)
+            means = self.means[:, :-6].double() + torch.einsum("mhc,nmc->nmh", regression, difference)
             index = top.indices[..., None].expand(-1, -1, len(self.joint_names))
             return torch.cat([means.gather(-2, index), top.values.exp()[..., None]], -1)
 
-        modes = map_rows(take, _codes(q))
+        modes = _map_codes(take, q)
         return modes[..., :-1], modes[..., -1]
-
-    def _log_responsibility(self, q: Float[Tensor, "n 6"]) -> Float[Tensor, "n m"]:
-        """Return the logarithm of the responsibility h_i of each component for a code, Eq. (23), free of underflow."""
-        return torch.log_softmax(self._code.log_joint(q), dim=-1)
 
     @checked
     def save(self, path: Path | str) -> Path:
@@ -215,17 +215,19 @@ class GraspMixture(GaussianMixture):
         >>> load_mixture(file).joint_names
         ('spread', 'f1_flex', 'f2_flex', 'f3_flex')
         """
-        tensors = {"weights": self.weights, "means": self.means, "covariances": self.covariances}
+        tensors = {name: getattr(self, name).detach() for name in ("weights", "means", "covariances")}
         meta = {**self.meta, "names": " ".join(self.names), "regularisation": repr(self.regularisation)}
         return save_tensors(path, "mixture", tensors, meta)
 
 
-def _codes(code: ContactCode | Tensor) -> Float[Tensor, "*b 6"]:
-    """Return the codes q as a tensor; raise `BadArgument` for rows that do not have six numbers."""
+def _map_codes(function: Callable[[Float[Tensor, "n 6"]], Tensor], code: ContactCode | Tensor) -> Tensor:
+    """Apply a function to all codes q; a code that is not finite gives NaN, and spoils no gradient."""
     q = code.q if isinstance(code, ContactCode) else code
     if q.ndim < 1 or q.shape[-1] != 6:
         raise BadArgument("code", f"shape {tuple(q.shape)}", "rows of 6 numbers, L and N")
-    return q
+    bad = ~torch.isfinite(q).all(-1)
+    y = map_rows(function, torch.where(bad[..., None], 0.0, q))
+    return torch.where(bad.view(bad.shape + (1,) * (y.ndim - bad.ndim)), torch.nan, y)
 
 
 @checked
