@@ -166,7 +166,7 @@ def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, s
 
 def reference_poses(urdf: Urdf, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
     """Return every link's pose in the root's frame by pytorch-kinematics; `values` are the positions of all joints."""
-    chain = chain_from_urdf(urdf, values.dtype)
+    chain = chain_from_urdf(urdf)
     names = [j.name for j in urdf.movable]
     order = [names.index(name) for name in chain.get_joint_parameter_names()]
     poses = chain.forward_kinematics_tensor(values[:, order], analytical_grad=False)

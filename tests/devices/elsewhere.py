@@ -98,6 +98,8 @@ class Elsewhere(Tensor):
                 return _plain(args[0]).clone()
             if func is Tensor.to:
                 return _to(args, kwargs)
+            if func is Tensor.__deepcopy__:
+                return elsewhere(args[0])
             _refuse_mixes(func, name, args, kwargs)
             result = func(
                 *(_home(_plain(x)) if not isinstance(x, list | tuple) else x for x in args), **_all_home(kwargs)

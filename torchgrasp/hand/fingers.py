@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -13,8 +13,11 @@ from torchgrasp.base import Value, check_device
 from torchgrasp.checks import ANY, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand_toml import HandSpec
-from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf
+from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_chain
 from torchgrasp.hand.urdf import Mimic, Urdf
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Chain
 
 ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
 """Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch."""
@@ -156,13 +159,13 @@ class Fingertips(Value):
         return frames, frames.index_select(2, self.carrier)
 
 
-def tips_from_files(spec: HandSpec, urdf: Urdf) -> Fingertips:
-    """Return the fingertips of the grasping fingers, as hand.toml and URDF describe them."""
+def tips_from_files(spec: HandSpec, urdf: Urdf, chain: "Chain") -> Fingertips:
+    """Return the fingertips of the grasping fingers, as hand.toml and the URDF's chain describe them."""
     links, tips = [x.name for x in urdf.links], tuple(f.tip_link for f in spec.fingers)
     pads = zip(*(f.pad for f in spec.fingers), strict=True)
     contact, normal, center, radius = (torch.tensor(x, dtype=torch.float64) for x in pads)
-    carriers, poses = zip(*(pose_in_carrier(urdf, tip) for tip in tips), strict=True)
-    chains = tree_from_urdf(urdf, carriers)
+    carriers, poses = zip(*(pose_in_carrier(chain, tip) for tip in tips), strict=True)
+    chains = tree_from_chain(chain, urdf, carriers)
     carrier = torch.tensor([chains.link_names.index(name) for name in carriers])
     index = torch.tensor([links.index(tip) for tip in tips])
     names = tuple(f.name for f in spec.fingers)

@@ -1,5 +1,6 @@
 """A robot hand: joints, kinematic tree, fingertips, and their kinematics."""
 
+import copy
 import dataclasses
 import functools
 import math
@@ -15,9 +16,8 @@ from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
-from torchgrasp.hand.kinematics import FreeMotion, KinematicTree, chain_from_urdf, map_directions, map_points
+from torchgrasp.hand.kinematics import FreeMotion, KinematicTree, map_directions, map_points
 from torchgrasp.hand.self_collision import SelfCollision
-from torchgrasp.hand.urdf import read_urdf
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Chain
@@ -59,6 +59,9 @@ class Hand(Value):
 
     Positions [m] are in the frame of the palm, the URDF's root link. `approach` is the direction out of the palm.
 
+    `chain` is the hand's model, a chain of pytorch-kinematics in which every movable joint is independent. `tree` and
+    `tips` are compiled from its tensors, so do not change it in place.
+
     `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
     `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
 
@@ -72,11 +75,14 @@ class Hand(Value):
     (torch.Size([12, 4, 4]), torch.Size([117, 3]), torch.Size([8]))
     >>> len(hand.expand(q)), bool(hand.self_clearance(q) > 0)
     (8, True)
+    >>> hand.chain.forward_kinematics(hand.expand(q[None]))["f3_tip"].get_matrix().shape
+    torch.Size([1, 4, 4])
     """
 
     name: str
     source: HandSource
     actuated: ActuatedJoints
+    chain: "Chain" = dataclasses.field(repr=False)
     tree: KinematicTree = dataclasses.field(repr=False)
     tips: Fingertips = dataclasses.field(repr=False)
     approach: Float[Tensor, "3"]
@@ -89,17 +95,11 @@ class Hand(Value):
         """Path of the hand's URDF."""
         return self.source.urdf_path
 
-    @functools.cached_property
-    def chain(self) -> "Chain":
-        """The hand as a chain of pytorch-kinematics, in which every movable joint is independent.
-
-        >>> from torchgrasp import load_hand
-        >>> hand, joints = load_hand("barrett"), torch.zeros(1, 4, dtype=torch.float64)
-        >>> hand.chain.forward_kinematics(hand.expand(joints))["f3_tip"].get_matrix().shape
-        torch.Size([1, 4, 4])
-        """
-        chain = chain_from_urdf(read_urdf(self.urdf_path))
-        return chain.to(dtype=self.lower.dtype, device=self.lower.device)
+    def to(self, *args: Any, **kwargs: Any) -> "Hand":
+        """Return the hand on another device or in another floating dtype, with its chain; see `Value.to`."""
+        moved = super().to(*args, **kwargs)
+        chain = copy.deepcopy(self.chain).to(dtype=moved.lower.dtype, device=moved.lower.device)
+        return dataclasses.replace(moved, chain=chain)
 
     @functools.cached_property
     def motion(self) -> FreeMotion:

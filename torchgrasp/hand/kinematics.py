@@ -1,12 +1,13 @@
-"""Forward kinematics of a URDF's tree, level by level, for all postures at once.
+"""Forward kinematics of a pytorch-kinematics chain, compiled from its tensors: level by level, all postures at once.
 
 The pose of a child link in its parent is `constant + sine sin q + cosine cos q + slide q`, where q is the position of
 the joint between them. The four tables are computed once.
 """
 
 import dataclasses
+import functools
 from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float, Int
@@ -14,8 +15,8 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import checked
-from torchgrasp.geometry.frames import rotation_from_rpy, skew
-from torchgrasp.hand.urdf import Joint, Urdf
+from torchgrasp.geometry.frames import rigid, rotation_from_rpy, skew
+from torchgrasp.hand.urdf import Urdf
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Chain
@@ -160,80 +161,84 @@ def map_directions(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
     return torch.addcmul(torch.addcmul(frames[:, 0] * x, frames[:, 1], y), frames[:, 2], z)
 
 
-def tree_from_urdf(urdf: Urdf, ends: Collection[str] | None = None) -> KinematicTree:
-    """Return the kinematic tree of a URDF, or the part of it that leads to the links `ends`."""
-    above = {j.child: j for j in urdf.joints}
-    part = {x.name for x in urdf.links} if ends is None else {urdf.root, *ends}
-    part |= {j.parent for end in ends or () for j in urdf.joints_above(end)}
-    levels = [[urdf.root]]
-    while below := [x.name for x in urdf.links if x.name in part & set(above) and above[x.name].parent in levels[-1]]:
-        levels.append(below)
-    names = [name for level in levels for name in level]
-    links = [x.name for x in urdf.links if x.name in part]
-    joints, index = urdf.movable, {j.child: k for k, j in enumerate(urdf.movable)}
-    parents = [[levels[k - 1].index(above[n].parent) if k else 0 for n in level] for k, level in enumerate(levels)]
-    movers = {name: set(urdf.joints_above(name)) for name in links}
+def chain_from_urdf(urdf: Urdf) -> "Chain":
+    """Return a URDF as a float64 pytorch-kinematics chain; coupled joints become independent.
+
+    The library's own reader rounds angles to float32, so its frames are made here.
+    """
+    from pytorch_kinematics import chain, frame, transforms
+
+    with torch.device("cpu"):  # the library makes some tensors on torch's default device
+        frames = {urdf.root: frame.Frame(urdf.root, frame.Link(urdf.root), frame.Joint(dtype=torch.float64))}
+        for j in urdf.joints:
+            place = rigid(rotation_from_rpy(j.rpy), torch.tensor(j.xyz, dtype=torch.float64))
+            ranges = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
+            kind = "revolute" if j.kind == "continuous" else j.kind
+            offset = transforms.Transform3d(matrix=place)
+            joint = frame.Joint(j.name, offset, kind, j.axis, torch.float64, "cpu", *ranges)
+            frames[j.child] = frame.Frame(j.child, frame.Link(j.child), joint)
+        for j in urdf.joints:
+            frames[j.parent].add_child(frames[j.child])
+        return chain.Chain(frames[urdf.root], torch.float64)
+
+
+def tree_from_urdf(urdf: Urdf) -> KinematicTree:
+    """Return the kinematic tree of a URDF, compiled from its chain."""
+    return tree_from_chain(chain_from_urdf(urdf), urdf)
+
+
+def tree_from_chain(chain: "Chain", urdf: Urdf, ends: Collection[str] | None = None) -> KinematicTree:
+    """Return the kinematic tree of a chain, or the part of it that leads to the links `ends`.
+
+    Axes, offsets, types and parents are the chain's; links and joints are in the order of the URDF.
+    """
+    model: Any = chain  # which declares no types
+    index, paths = chain.frame_to_idx, [path.tolist() for path in model.parents_indices]
+    part = {k for name in (index if ends is None else (urdf.root, *ends)) for k in paths[index[name]]}
+    at = [k for x in urdf.links if (k := index[x.name]) in part]
+    levels = [[k for k in at if len(paths[k]) == d] for d in range(1, 1 + max(len(paths[k]) for k in at))]
+    order, names = [k for level in levels for k in level], [j.name for j in urdf.movable]
+    moved, own, slides = chain.get_joint_parameter_names(), model.joint_indices.tolist(), model.joint_type_indices == 2
+    joints = [moved.index(name) for name in names]
+    frames = [own.index(k) for k in joints]
+    new: Any = functools.partial(torch.tensor, device="cpu")
     return KinematicTree(
-        link_names=tuple(links),
-        joint_names=tuple(j.name for j in joints),
-        child=torch.tensor([links.index(j.child) if j.child in part else 0 for j in joints], dtype=torch.long),
-        axis=torch.tensor([j.axis for j in joints], dtype=torch.float64).reshape(-1, 3),
-        prismatic=torch.tensor([float(j.kind == "prismatic") for j in joints], dtype=torch.float64),
-        moves=torch.tensor([[float(j in movers[n]) for j in joints] for n in links], dtype=torch.float64),
-        tables=torch.stack([_tables(above.get(name)) for name in names], -1)[..., None],
-        joint=torch.tensor([index.get(name, 0) for name in names]),
-        parent=torch.tensor([k for level in parents for k in level]),
-        level_sizes=tuple(len(level) for level in levels),
-        places=torch.tensor([names.index(name) for name in links]),
-        slides=any(j.kind == "prismatic" and j.child in part for j in joints),
+        link_names=tuple(chain.idx_to_frame[k] for k in at),
+        joint_names=tuple(names),
+        child=new([at.index(k) if k in part else 0 for k in frames], dtype=torch.long),
+        axis=chain.axes[joints],
+        prismatic=slides[frames].to(chain.axes),
+        moves=new([[float(k in paths[link]) for k in frames] for link in at], dtype=torch.float64),
+        tables=torch.stack([_tables(chain, k) for k in order], -1)[..., None],
+        joint=new([joints.index(own[k]) if own[k] >= 0 else 0 for k in order]),
+        parent=new([levels[d - 1].index(paths[k][-2]) if d else 0 for d, level in enumerate(levels) for k in level]),
+        level_sizes=tuple(map(len, levels)),
+        places=new([order.index(k) for k in at]),
+        slides=bool(slides[at].any()),
     )
 
 
-def chain_from_urdf(urdf: Urdf, dtype: torch.dtype = torch.float64) -> "Chain":
-    """Return a URDF as a pytorch-kinematics chain with unrounded angles; coupled joints become independent."""
-    from pytorch_kinematics.chain import Chain
-    from pytorch_kinematics.frame import Frame, Link
-    from pytorch_kinematics.frame import Joint as Mover
-    from pytorch_kinematics.transforms import Transform3d
-
-    frames = {urdf.root: Frame(urdf.root, Link(urdf.root), Mover(dtype=dtype))}
-    for j in urdf.joints:
-        offset = Transform3d(
-            dtype=dtype, rot=rotation_from_rpy(j.rpy).to(dtype), pos=torch.tensor([j.xyz], dtype=dtype)
-        )
-        limits, speeds, efforts = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
-        mover = Mover(j.name, offset, j.kind, j.axis, dtype, "cpu", limits, speeds, efforts)
-        frames[j.child] = Frame(j.child, Link(j.child), mover)
-    for j in urdf.joints:
-        frames[j.parent].add_child(frames[j.child])
-    return Chain(frames[urdf.root], dtype)
-
-
-def pose_in_carrier(urdf: Urdf, link: str) -> tuple[str, Float[Tensor, "3 4"]]:
+def pose_in_carrier(chain: "Chain", link: str) -> tuple[str, Float[Tensor, "3 4"]]:
     """Return a link's carrier (the nearest link, itself or above, that a joint moves), and the link's pose in it."""
-    above = {j.child: j for j in urdf.joints}
-    pose = _tables(None)[0]
-    while link in above and above[link].kind == "fixed":
-        step = _tables(above[link])[0]
+    *above, carrier = chain.parents_indices[chain.frame_to_idx[link]].tolist()
+    pose = _tables(chain, 0)[0]
+    while above and chain.joint_indices[carrier] < 0:
+        step = _tables(chain, carrier)[0]
         pose = torch.cat([step[:, :3] @ pose[:, :3], step[:, :3] @ pose[:, 3:] + step[:, 3:]], 1)
-        link = above[link].parent
-    return link, pose
+        carrier = above.pop()
+    return chain.idx_to_frame[carrier], pose
 
 
-def _tables(joint: Joint | None) -> Float[Tensor, "4 3 4"]:
-    """Return four 3 x 4 tables: a joint's pose in its parent is their sum, weighted by 1, sin q, cos q and q."""
-    tables = torch.zeros(4, 3, 4, dtype=torch.float64)
-    constant, sine, cosine, slide = tables
-    if joint is None:
-        constant[:, :3] = torch.eye(3)
-        return tables
-    rotation = rotation_from_rpy(joint.rpy)
-    constant[:, :3], constant[:, 3] = rotation, torch.tensor(joint.xyz, dtype=torch.float64)
-    axis = torch.tensor(joint.axis, dtype=torch.float64)
-    if joint.kind == "prismatic":
-        slide[:, 3] = rotation @ axis
-    elif joint.kind == "revolute":  # Rodrigues: I + K sin q + K^2 (1 - cos q), K the cross product with the axis
-        cross = skew(axis)
-        sine[:, :3], cosine[:, :3] = rotation @ cross, -rotation @ cross @ cross
-        constant[:, :3] -= cosine[:, :3]
-    return tables
+def _tables(chain: "Chain", frame: int) -> Float[Tensor, "4 3 4"]:
+    """Return four 3 x 4 tables: a frame's pose in its parent is their sum, weighted by 1, sin q, cos q and q."""
+    offset, kind, joint = chain.joint_offsets[frame], chain.joint_type_indices[frame], chain.joint_indices[frame]
+    constant = chain.identity[0, :3] if offset is None else offset[0, :3]
+    rotation, still = constant[:, :3], torch.zeros_like(constant)
+    if kind == 0:
+        return torch.stack([constant, still, still, still])
+    axis = chain.axes[joint]
+    if kind == 2:
+        return torch.stack([constant, still, still, torch.cat([still[:, :3], (rotation @ axis)[:, None]], 1)])
+    cross = skew(axis)  # Rodrigues: I + K sin q + K^2 (1 - cos q), K the cross product with the axis
+    sine, cosine = (torch.cat([x, still[:, 3:]], 1) for x in (rotation @ cross, -rotation @ cross @ cross))
+    return torch.stack([constant - cosine, sine, cosine, still])

@@ -11,7 +11,7 @@ from torchgrasp.hand.collision_shapes import self_collision_from_urdf, spheres_f
 from torchgrasp.hand.fingers import joints_from_files, tips_from_files
 from torchgrasp.hand.hand import Actuator, Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
-from torchgrasp.hand.kinematics import tree_from_urdf
+from torchgrasp.hand.kinematics import chain_from_urdf, tree_from_chain
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.values import Grasps
 
@@ -74,13 +74,15 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     urdf = read_urdf(spec.urdf)
     _check_names(spec, urdf)
     _check_mimics_and_shapes(spec, urdf)
+    chain = chain_from_urdf(urdf)
     digest = hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()
     return Hand(
         name=spec.name,
         source=HandSource(spec.option, urdf.path, digest, tuple(spec.options)),
         actuated=joints_from_files(spec, urdf),
-        tree=tree_from_urdf(urdf),
-        tips=tips_from_files(spec, urdf),
+        chain=chain,
+        tree=tree_from_chain(chain, urdf),
+        tips=tips_from_files(spec, urdf, chain),
         approach=torch.tensor(spec.approach, dtype=torch.float64),
         actuators={j.name: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for j in urdf.movable},
         collision_spheres=spheres_from_urdf(urdf, spec),

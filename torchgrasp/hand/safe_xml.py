@@ -17,13 +17,14 @@ IGNORED = {"material", "transmission", "gazebo", "ros2_control", "mujoco", "sens
 """Elements of a robot, besides links and joints, that are left out."""
 NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 """A decimal number; Python also reads 1_0, digits outside ASCII, and nan."""
-SHAPES = ("box", "cylinder", "sphere", "mesh")  # collision shapes of a URDF
+SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
+"""The collision shapes of a URDF, and the attributes that hold the sizes of each."""
 PARTS = {
     "robot": ("link", "joint"),
     "link": ("inertial", "collision"),
     "inertial": ("origin", "mass", "inertia"),
     "collision": ("origin", "geometry"),
-    "geometry": SHAPES,
+    "geometry": tuple(SIZES),
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
 }
 """The elements that are read, by the element around them. `<visual>` is left out, with its mesh."""
@@ -103,9 +104,10 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
     where = "" if tag == "robot" else f"{where} {tag} {(element.get('name') or '')[:XML_LETTERS]}".strip()
     for key in WORDS.get(tag, ()):
         word = element.get(key, "")
-        if not 0 < len(word) <= XML_LETTERS:
-            found = "without one" if not word else f"of {len(word)} letters"
-            raise HandFileError("urdf", f"{path}: {where}: a {key} {found}", f"a {key} of 1 to {XML_LETTERS} letters")
+        if not 0 < len(word) <= XML_LETTERS or not word.isprintable():
+            found = "without one" if not word else f"of {len(word)} letters: {word[:20]!r}"
+            allowed = f"a {key} of 1 to {XML_LETTERS} printable letters"
+            raise HandFileError("urdf", f"{path}: {where}: a {key} {found}", allowed)
         clean.set(key, word)
     for key, (count, default) in NUMBERS.get(tag, {}).items():
         text = element.get(key, default)
@@ -118,7 +120,7 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
             raise HandFileError(
                 "urdf", f"{path}: {found}", f"{count} finite numbers" if count > 1 else "a finite number"
             )
-    if tag == "geometry" and (len(element) != 1 or element[0].tag not in SHAPES):
+    if tag == "geometry" and (len(element) != 1 or element[0].tag not in SIZES):
         found = f"{where} <{element[0].tag}>" if len(element) == 1 else f"{where} without one shape"
         raise HandFileError("urdf", f"{path}: {found}", "box, cylinder or sphere")
     kept = PARTS.get(tag, ())

@@ -1,24 +1,28 @@
-"""A URDF as values: the checked tree of links, joints and collision shapes. Mesh files are not opened."""
+"""A URDF as values: the checked tree of links, joints and collision shapes. Mesh files are not opened.
+
+The gate in `safe_xml` checks a file's bytes; yourdfpy reads the checked elements alone.
+"""
 
 import dataclasses
 import functools
+import io
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import torch
+import numpy as np
 
 from torchgrasp.checks import checked
 from torchgrasp.errors import HandFileError
 from torchgrasp.files import read_bounded
-from torchgrasp.geometry.frames import rotation_from_rpy
-from torchgrasp.hand.safe_xml import parse_urdf
+from torchgrasp.hand.safe_xml import SIZES, parse_urdf
 from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
-SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
-"""The attributes that hold the sizes of each kind of shape."""
+if TYPE_CHECKING:
+    import yourdfpy
+
 REPAIR = "(torchgrasp hand new writes a clean copy)"
 """The end of an error about a published URDF that the library cannot use as it is."""
 
@@ -151,68 +155,70 @@ def read_published(path: Path | str) -> Urdf:
         HandFileError: the file is missing, too large, hostile or not a tree of links.
     """
     path = Path(path)
-    data = read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf"))
-    robot = parse_urdf(path, data)  # links and joints alone, each with all of its names and with finite numbers
-    links, joints = tuple(map(_link, robot.findall("link"))), tuple(map(_joint, robot.findall("joint")))
-    urdf = Urdf(path, robot.attrib["name"], "", links, joints, data, ET.tostring(robot))
+    return _parse(path, read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf")))
+
+
+@functools.lru_cache(maxsize=16)
+def _parse(path: Path, data: bytes) -> Urdf:
+    """Return a file's bytes as checked values; the latest files are kept, as many callers read the same hand again."""
+    import yourdfpy
+
+    clean = parse_urdf(path, data)  # links and joints alone, each with all of its names and with finite numbers
+    xml = ET.tostring(clean)
+    robot: yourdfpy.Robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
+    links = tuple(_link(*pair) for pair in zip(robot.links, clean.findall("link"), strict=True))
+    joints = tuple(_joint(*pair) for pair in zip(robot.joints, clean.findall("joint"), strict=True))
+    urdf = Urdf(path, robot.name, "", links, joints, data, xml)
     _check_names(urdf)
     _check_shapes(urdf)
     _check_joints(urdf)
     return dataclasses.replace(urdf, root=_check_tree(urdf))
 
 
-def _part(element: ET.Element, tag: str) -> ET.Element:
-    """Return the first child element with a tag; the checks in `parse_urdf` ensure that there is one."""
-    return next(element.iter(tag))
+def _place(origin: Any, element: ET.Element | None) -> tuple[Triple, Triple]:
+    """Return translation [m] and fixed-axis angles [rad]; yourdfpy keeps a matrix, so the XML gives the angles."""
+    if origin is None or element is None:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    (x, y, z), (roll, pitch, yaw) = origin[:3, 3] + 0.0, map(float, element.attrib["rpy"].split())  # no negative zero
+    return (float(x), float(y), float(z)), (roll + 0.0, pitch + 0.0, yaw + 0.0)
 
 
-def _floats(element: ET.Element, *keys: str) -> list[float]:
-    """Return the numbers in attributes that `parse_urdf` has checked; negative zero becomes zero."""
-    return [float(word) + 0.0 for key in keys for word in element.attrib[key].split()]
+def _link(link: "yourdfpy.Link", element: ET.Element) -> Link:
+    """Return a link; its inertia is rotated into the link's axes."""
+    shapes = tuple(_shape(*pair) for pair in zip(link.collisions, element.findall("collision"), strict=True))
+    body: Any = link.inertial
+    if body is None:
+        return Link(link.name, 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
+    com, rpy = _place(body.origin, element.find("inertial/origin"))
+    turned = body.origin[:3, :3] @ body.inertia @ body.origin[:3, :3].T if any(rpy) else body.inertia + 0.0
+    return Link(link.name, body.mass + 0.0, com, tuple(turned[([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])].tolist()), shapes)
 
 
-def _origin(element: ET.Element) -> tuple[Triple, Triple]:
-    """Return translation [m] and fixed-axis angles [rad] of an element; zeros without an `<origin>`."""
-    origin = element.find("origin")
-    x, y, z, roll, pitch, yaw = [0.0] * 6 if origin is None else _floats(origin, "xyz", "rpy")
-    return (x, y, z), (roll, pitch, yaw)
+def _shape(collision: "yourdfpy.Collision", element: ET.Element) -> Shape:
+    kind, shape = next((kind, shape) for kind, shape in vars(collision.geometry).items() if shape is not None)
+    size = [float(x) + 0.0 for key in SIZES[kind] for x in np.atleast_1d(getattr(shape, key))]
+    return Shape(kind, tuple(size), *_place(collision.origin, element.find("origin")), getattr(shape, "filename", ""))
 
 
-def _link(link: ET.Element) -> Link:
-    """Read a link; its inertia is rotated into the link's axes."""
-    shapes, inertial = tuple(map(_shape, link.findall("collision"))), link.find("inertial")
-    if inertial is None:
-        return Link(link.attrib["name"], 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
-    com, rpy = _origin(inertial)
-    xx, xy, xz, yy, yz, zz = inertia = _floats(_part(inertial, "inertia"), "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    if any(rpy):
-        turn = rotation_from_rpy(rpy)
-        turned = turn @ turn.new_tensor([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-        inertia = turned[tuple(torch.triu_indices(3, 3))].tolist()
-    return Link(link.attrib["name"], _floats(_part(inertial, "mass"), "value")[0], com, tuple(inertia), shapes)
-
-
-def _shape(collision: ET.Element) -> Shape:
-    shape = _part(collision, "geometry")[0]
-    return Shape(shape.tag, tuple(_floats(shape, *SIZES[shape.tag])), *_origin(collision), shape.get("filename", ""))
-
-
-def _joint(joint: ET.Element) -> Joint:
-    """Read a joint. Its default axis is x, as in ROS; a continuous joint gets no limits."""
-    name, kind, (xyz, rpy) = joint.attrib["name"], joint.attrib["type"], _origin(joint)
-    parent, child = (_part(joint, tag).attrib["link"] for tag in ("parent", "child"))
-    if kind == "fixed":
-        return Joint(name, kind, parent, child, xyz, rpy)
-    axis, limit, mimic = (joint.find(tag) for tag in ("axis", "limit", "mimic"))
-    x, y, z = (1.0, 0.0, 0.0) if axis is None else _floats(axis, "xyz")
+def _joint(joint: "yourdfpy.Joint", element: ET.Element) -> Joint:
+    """Return a joint. Its default axis is x, as in ROS; a continuous joint gets no limits."""
+    read: Any = joint  # the gate has given every attribute a number, but for limits
+    xyz, rpy = _place(joint.origin, element.find("origin"))
+    if joint.type == "fixed":
+        return Joint(joint.name, "fixed", read.parent, read.child, xyz, rpy)
+    x, y, z = joint.axis.tolist()
     length = math.sqrt(x * x + y * y + z * z)
     length = length if _is_unit(length) else 1.0  # refused later
-    limits = {} if limit is None else {key: float(word) for key, word in limit.attrib.items()}
-    ends = {} if kind == "continuous" else limits
-    unit, low, high = (x / length, y / length, z / length), ends.get("lower", -math.inf), ends.get("upper", math.inf)
-    drive = limits.get("effort", 0.0), limits.get("velocity", 0.0)
-    follows = None if mimic is None else Mimic(mimic.attrib["joint"], *_floats(mimic, "multiplier", "offset"))
-    return Joint(name, kind, parent, child, xyz, rpy, unit, low, high, *drive, follows)
+    low = high = effort = velocity = None
+    if read.limit is not None:
+        low, high, effort, velocity = (getattr(read.limit, key) for key in ("lower", "upper", "effort", "velocity"))
+    if joint.type == "continuous":
+        low = high = None
+    mimic = None if read.mimic is None else Mimic(read.mimic.joint, read.mimic.multiplier, read.mimic.offset)
+    return Joint(
+        joint.name, read.type, read.parent, read.child, xyz, rpy, (x / length, y / length, z / length),
+        -math.inf if low is None else low, math.inf if high is None else high, effort or 0.0, velocity or 0.0, mimic,
+    )  # fmt: skip
 
 
 def _is_unit(length: float) -> bool:
@@ -274,10 +280,13 @@ def _check_tree(urdf: Urdf) -> str:
     roots = sorted(known - {j.child for j in urdf.joints})
     if len(roots) != 1:
         raise urdf.wrong(f"roots {roots}" if roots else "a cycle and no root", "exactly one root link")
-    reached, front = {roots[0]}, [roots[0]]
+    reached, front, depth, deepest = {roots[0]}, [roots[0]], 0, 100  # pytorch-kinematics walks the tree by recursion
     while front:
         front = [j.child for j in urdf.joints if j.parent in front]
         reached |= set(front)
+        depth += 1
     if len(reached) < len(known):
         raise urdf.wrong(f"a cycle around {sorted(known - reached)[0]!r}", "a tree")
+    if depth > deepest:
+        raise urdf.wrong(f"{depth} links in a line", f"at most {deepest} links from the root to a tip")
     return roots[0]
