@@ -191,7 +191,9 @@ def _link(link: "yourdfpy.Link", element: ET.Element) -> Link:
         return Link(link.name, 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
     com, rpy = _place(body.origin, element.find("inertial/origin"))
     turned = body.origin[:3, :3] @ body.inertia @ body.origin[:3, :3].T if any(rpy) else body.inertia + 0.0
-    return Link(link.name, body.mass + 0.0, com, tuple(turned[([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])].tolist()), shapes)
+    return Link(
+        link.name, body.mass + 0.0, com, tuple(turned[([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])].tolist()), shapes
+    )
 
 
 def _shape(collision: "yourdfpy.Collision", element: ET.Element) -> Shape:
