@@ -152,5 +152,5 @@ def test_rows_that_are_not_finite_are_not_closed_and_harm_no_other_and_no_rows_g
 def test_certify_accepts_no_balance_with_a_residual(monkeypatch, residual, closed):
     module = sys.modules["torchgrasp.plan.certify"]  # the package has a function of this name
     monkeypatch.setattr(module, "EXACT", -1.0)  # every row is given to HiGHS
-    monkeypatch.setattr(module, "solve_by_highs", lambda wrench: (0.01, residual, None))
+    monkeypatch.setattr(module, "solve_by_highs", lambda wrench: (0.01, residual, None, torch.zeros(len(wrench))))
     assert bool(certify(Contacts(spokes(), spokes()), SPEC).closed) is closed

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import settle
-from torchgrasp.checks import Positive, Range, checked
+from torchgrasp.base import named_tensors, settle
+from torchgrasp.checks import Positive, Range, check_dense, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.hand.hand import Hand
@@ -45,13 +45,14 @@ class Squeeze(NamedTuple):
     torques: Float[Tensor, "g h"]
 
 
-@checked
+@checked(gradients=True)
 def squeeze(
     hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
 ) -> Squeeze:
     """Return joint targets with which position-controlled fingers press at their planned contacts.
 
-    The targets solve J^T f = kp (target - q) for the `desired_forces` f. They may exceed a joint's limits.
+    The targets solve J^T f = kp (target - q) for the `desired_forces` f. They may exceed a joint's limits. They are
+    differentiable in the joints of the grasps; the forces, found by a search, are not differentiable in the contacts.
 
     Args:
         hand: the hand; it follows the grasps to their device.
@@ -60,7 +61,8 @@ def squeeze(
         kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
 
     Raises:
-        BadArgument: joints or fingers of another hand, or a force or stiffness that is not positive.
+        BadArgument: joints or fingers of another hand, a force or stiffness that is not positive, contacts or poses by
+            which derivatives are taken.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -68,6 +70,8 @@ def squeeze(
     tensor([[2., 2., 4.]], dtype=torch.float64)
     """
     check_hand(hand, grasps)
+    for name, x in named_tensors(grasps, "grasps.").items():
+        check_dense(name, x, gradients=name == "grasps.joints")
     hand, joints = settle(hand.to(torch.float64), grasps.joints.device), grasps.joints.double()
     points, normals = contacts_in_hand(grasps)
     forces = desired_forces(points, normals, force)

@@ -3,15 +3,20 @@
 Positive coefficients phi that balance all contact wrenches prove closure, and bound its margin from below. A witness,
 which is a wrench that no contact opposes, disproves closure, and bounds the margin from above. A batched simplex method
 (module `closure`) finds both. The solver HiGHS decides where the two bounds leave the verdict open.
+
+The multipliers y of W phi = 0 are a multiple of the witness. By the envelope theorem a change dW of the wrenches
+changes the margin by -y . (dW phi).
 """
+
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS
-from torchgrasp.checks import checked
+from torchgrasp.checks import checked, is_known
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.plan.closure import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, solve_closure_lp, wrenches
@@ -26,7 +31,7 @@ STRICT = 1e-10  # tolerance of HiGHS, its least. With its default, 1e-7, margins
 UNIT_TOLERANCE = 1e-3  # largest difference of a given normal's length from 1: what rounding in a text file leaves
 
 
-@checked
+@checked(gradients=True)
 @single_threaded
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Prove in float64 whether contact sets have frictional form closure, Eq. (13) of the paper.
@@ -38,6 +43,10 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     If a set is not closed, its `witness` v is a wrench that no contact force opposes: v.w >= 0 for every edge wrench w,
     up to rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only the rank is too low, the wrenches are
     smallest along v. Sets with contacts that are not finite are not closed, and their margin and witness are NaN.
+
+    The margin is differentiable once in points and normals. Where several phi or v are optimal, its derivative is
+    that of one of them; where the margin is -inf, its derivative is NaN. A second derivative, and one of another field,
+    raise `BadArgument`; in forward mode the latter is NaN.
 
     Args:
         contacts: sets of three to five contacts with outward unit normals, from any planner.
@@ -51,31 +60,94 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec
-    points, normals = (x.detach().double().cpu() for x in (check_contacts(contacts).points, contacts.normals))
-    check_unit(normals)
-    finite = torch.isfinite(points).flatten(1).all(-1) & torch.isfinite(normals).flatten(1).all(-1)
-    margin, ratio, residual = (torch.full((len(points),), torch.nan, dtype=torch.float64) for _ in range(3))
-    witness = torch.full((len(points), 6), torch.nan, dtype=torch.float64)
-    points = points[finite]
-    wrench = wrenches(points, normals[finite], spec.planned_friction, spec.edges)
-    ratio[finite] = rank_ratio(wrench)
-    full_rank = (ratio[finite] >= MIN_RANK_RATIO) & ~degenerate(points)
-    margin[finite], residual[finite], witness[finite] = _prove(wrench.flatten(1, 2))
-    balanced = (margin >= MIN_MARGIN) & (residual <= MAX_RESIDUAL)
-    closed = balanced.clone()
-    closed[finite] &= full_rank
-    lacking = torch.nonzero(balanced & ~closed)[:, 0]
-    if len(lacking):
-        flat = wrench[torch.nonzero(balanced[finite] & ~full_rank)[:, 0]].flatten(1, 2)
-        witness[lacking] = torch.linalg.svd(flat, full_matrices=False).Vh[:, -1]
-    device = contacts.points.device
-    return Certificate(*(t.to(device) for t in (margin, ratio, residual, closed, witness)))
+    points, normals = (x.double().cpu() for x in (check_contacts(contacts).points, contacts.normals))
+    wrench = wrenches(points, check_unit(normals), spec.planned_friction, spec.edges)
+    proof = _Proof.apply(wrench.flatten(1, 2), degenerate(points))
+    return Certificate(*(t.to(contacts.points.device) for t in proof[:5]))
 
 
-def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b 6"]]:
-    """Return for m wrenches the margin of force closure, the residual force or torque, and a witness wrench.
+class _Proof(torch.autograd.Function):
+    """The fields of a `Certificate`, and the slope of its margin in the m wrenches, from the wrenches of b sets.
 
-    The witness proves that no margin is greater.
+    `flat` tells which sets lie on a line.
+    """
+
+    @staticmethod
+    def forward(wrench: Float[Tensor, "b m 6"], flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
+        """Return margin, rank ratio, residual, closed, witness and slope; NaN for wrenches that are not finite."""
+        b, m, _ = wrench.shape
+        margin, ratio, residual = (wrench.new_full((b,), torch.nan) for _ in range(3))
+        witness, slope = wrench.new_full((b, 6), torch.nan), wrench.new_full((b, m, 6), torch.nan)
+        finite = torch.isfinite(wrench).flatten(1).all(-1)
+        known = wrench[finite]
+        ratio[finite] = rank_ratio(known[:, None])
+        margin[finite], residual[finite], witness[finite], slope[finite] = _prove(known)
+        balanced = (margin >= MIN_MARGIN) & (residual <= MAX_RESIDUAL)
+        closed = balanced & (ratio >= MIN_RANK_RATIO) & ~flat
+        lacking = torch.nonzero(balanced & ~closed)[:, 0]
+        if len(lacking):
+            witness[lacking] = torch.linalg.svd(wrench[lacking], full_matrices=False).Vh[:, -1]
+        return margin, ratio, residual, closed, witness, slope
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        """Keep what the derivatives need."""
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(output[3], output[5])
+        ctx.save_for_backward(inputs[0], output[-1])
+        ctx.save_for_forward(inputs[0], output[-1])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, None]:
+        """Return the derivative in the wrenches; raise `BadArgument` unless it is of the margin alone."""
+        margin, wrench, slope = grads[0], *ctx.saved_tensors
+        if any(x is not None for x in grads[1:]):
+            raise BadArgument("contacts", "a derivative of another field of the certificate", "one of its margin")
+        return None if margin is None else _Once.apply(margin[:, None, None] * slope, wrench), None
+
+    @staticmethod
+    def jvp(ctx: Any, *grad_inputs: Any) -> tuple[Tensor | None, ...]:
+        """Return the change of the margin; of other fields it is NaN."""
+        wrench, slope = ctx.saved_tensors
+        change = _Once.apply((grad_inputs[0] * slope).sum((1, 2)), wrench)
+        unknown = torch.full_like(change, torch.nan)
+        return change, unknown, unknown, None, unknown[:, None].repeat(1, 6), None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Tensor) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        """Prove the sets of all values of an axis together."""
+        pairs = zip(args, in_dims, strict=True)
+        rows = [x.expand(info.batch_size, *x.shape) if k is None else x.movedim(k, 0) for x, k in pairs]
+        proof = _Proof.apply(*(x.flatten(0, 1) for x in rows))
+        return tuple(x.unflatten(0, rows[0].shape[:2]) for x in proof), (0,) * len(proof)
+
+
+class _Once(torch.autograd.Function):
+    """A first derivative of the margin, in the `wrench`; to differentiate it again is an error."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(derivative: Tensor, wrench: Tensor) -> Tensor:
+        """Return the derivative."""
+        return derivative.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        """Keep nothing."""
+
+    @staticmethod
+    def backward(ctx: Any, *_: Any) -> Any:
+        """Raise `BadArgument`."""
+        raise BadArgument("contacts", "a second derivative of the margin", "a first derivative: the rest is not smooth")
+
+    jvp = backward
+
+
+def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
+    """Return for m wrenches the margin of force closure, the residual force or torque, a witness wrench, and a slope.
+
+    The witness proves that no margin is greater. The slope is the margin's derivative by the wrenches.
     """
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
@@ -84,9 +156,12 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b"], Float[Te
     margin, residual = torch.where(unbalanced, -torch.inf, margin), torch.where(unbalanced, torch.inf, residual)
     proven = (residual <= EXACT) & (upper - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
     for row in torch.nonzero(~(proven | unbalanced))[:, 0].tolist():
-        margin[row], residual[row], dual = solve_by_highs(wrench[row].numpy())
+        margin[row], residual[row], dual, phi[row] = solve_by_highs(wrench[row].numpy())
         witness[row] = witness[row] if dual is None else torch.from_numpy(dual)
-    return margin, residual, witness
+    product = (wrench @ witness[..., None])[..., 0]
+    dual = witness / (product - product.amin(-1, keepdim=True)).sum(-1, keepdim=True)
+    slope = torch.where(margin.isinf()[:, None, None], torch.nan, -phi[..., None] * dual[:, None])
+    return margin, residual, witness, slope
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
@@ -97,8 +172,8 @@ def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) 
     return -least / (product - least[:, None]).sum(-1)
 
 
-def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]:
-    """Return closure margin, residual max |W phi| and witness (None if unknown) of one set of m wrenches, by HiGHS."""
+def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None, Tensor]:
+    """Return closure margin, residual max |W phi|, witness (None if unknown) and phi of m wrenches, by HiGHS."""
     from scipy.optimize import linprog
 
     m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
@@ -114,16 +189,18 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None]
         options={"primal_feasibility_tolerance": STRICT, "dual_feasibility_tolerance": STRICT},
     )
     if solution.x is None:
-        return -np.inf, np.inf, None
+        return -np.inf, np.inf, None, torch.zeros(m, device="cpu")
     phi, dual = solution.x[:m] + solution.x[m], solution.eqlin.marginals[:6]
     length = np.linalg.norm(dual)
     witness = -dual / length if length > 0 else None  # no multipliers: the balance of wrenches costs no margin
-    return float(solution.x[m]), float(np.abs(phi @ wrench).max()), witness
+    return float(solution.x[m]), float(np.abs(phi @ wrench).max()), witness, torch.from_numpy(phi)
 
 
 def check_unit(normals: Vectors) -> Vectors:
     """Return the normals; raise `BadArgument` if the length of a normal is not 1. Normals with NaN are accepted."""
-    length = torch.linalg.vector_norm(normals, dim=-1)
+    if not is_known(normals):
+        return normals
+    length = torch.linalg.vector_norm(normals.detach(), dim=-1)
     wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
     if len(wrong):
         row, contact = wrong[0].tolist()
