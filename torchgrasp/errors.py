@@ -126,6 +126,14 @@ class TwoBodies(CloudWarning):
     """The cloud shows two separate bodies."""
 
 
+class FewPoints(CloudWarning):
+    """The cloud has too few points to show a shape."""
+
+
+class Flat(CloudWarning):
+    """All points lie in one plane, so that the thickness is a guess."""
+
+
 class Status(enum.IntEnum):
     """The outcome of one row of a batch, such as one grasp; `sentence` explains the outcome.
 

@@ -8,7 +8,7 @@ import torch
 
 from tests.make import ball
 from torchgrasp.cloud import check, diagnose, prepare
-from torchgrasp.errors import BadArgument, GraspError, SuspiciousScale, TooFewPoints
+from torchgrasp.errors import BadArgument, Flat, GraspError, SuspiciousScale, TooFewPoints
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values import PointCloud
@@ -76,13 +76,13 @@ def test_fewer_than_four_points_are_refused(name, n):
 @pytest.mark.promise("I3")
 @pytest.mark.parametrize("distance", [0.0, 1e-12, 5e-10])
 def test_copies_change_nothing(distance):
-    cloud = ball(91, viewpoint=EYE.clone())
-    jitter = 0.08 * distance * unit(torch.randn(5 * 91, 3, generator=torch.Generator().manual_seed(1)).double())
+    cloud = ball(121, viewpoint=EYE.clone())
+    jitter = 0.08 * distance * unit(torch.randn(5 * 121, 3, generator=torch.Generator().manual_seed(1)).double())
     copies = PointCloud(
         torch.cat([cloud.points, cloud.points.repeat(5, 1) + jitter]), cloud.normals.repeat(6, 1), cloud.viewpoint
     )
-    assert len(check.remove_duplicates(copies)) == 91
-    assert diagnose.diagnose_cloud(copies).copies == 5 * 91
+    assert len(check.remove_duplicates(copies)) == 121
+    assert diagnose.diagnose_cloud(copies).copies == 5 * 121
     for support in ("camera", "paper"):
         once, six = (fit_shape(c, support=support).predict(1.1 * cloud.points[:9]) for c in (cloud, copies))
         torch.testing.assert_close(six.distance, once.distance, atol=1e-6, rtol=0)
@@ -103,8 +103,9 @@ def test_a_flat_cloud_is_accepted_and_finite(thickness):
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     points = points * torch.tensor([0.1, 0.1, 0.1 * thickness]).double()
     report = diagnose.diagnose_cloud(PointCloud(points, None, EYE))
-    assert any("one plane" in str(text) for text in report.advice) or thickness == 1e-3
-    estimate = fit_shape(PointCloud(points, None, EYE)).predict(points[:20])
+    assert any("one plane" in str(text) for text in report.advice)
+    with pytest.warns(Flat):
+        estimate = fit_shape(PointCloud(points, None, EYE)).predict(points[:20])
     for field in ("distance", "normal", "variance", "covariance", "std_m"):
         assert bool(torch.isfinite(getattr(estimate, field)).all())
 

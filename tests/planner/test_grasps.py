@@ -10,6 +10,7 @@ from torchgrasp import (
     ContactPlan,
     Contacts,
     ContactSpec,
+    PointCloud,
     Status,
     explain_empty,
     load_grasps,
@@ -163,3 +164,14 @@ def test_no_triples_is_an_answer_and_spread_rows_are_far_apart():
     assert 3 not in rows.tolist()
     assert int((rows >= 24).sum()) <= 1
     assert len(spread_rows(plan, 100)) == 49
+
+
+@pytest.mark.filterwarnings("ignore::torchgrasp.errors.CloudWarning")
+@pytest.mark.parametrize("rows", [slice(0, 20), slice(0, None)])
+def test_success_is_unknown_where_the_cloud_has_few_points_or_one_flat_face(rows):
+    draw = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    face = draw * torch.tensor([0.0, 0.08, 0.12]) + torch.tensor([0.0, 0.0, 0.06])
+    seen = VIEW.points[rows] if rows.stop else face
+    grasps = plan_grasps(PointCloud(seen, viewpoint=VIEW.viewpoint), load_hand("barrett"), SPEC, starts=20)
+    good = grasps[grasps.status == Status.OK]
+    assert len(good) and bool(good.success.isnan().all())

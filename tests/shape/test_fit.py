@@ -112,6 +112,7 @@ def test_a_whole_surface_without_normals_is_refused_and_not_turned_inside_out(vi
 
 
 @pytest.mark.promise("N8")
+@pytest.mark.filterwarnings("ignore::torchgrasp.errors.FewPoints")
 def test_few_points_in_float32_give_a_shape_in_float64(cloud: PointCloud):
     few = PointCloud(cloud.points[::30], None, cloud.viewpoint).to(torch.float32)
     shape = fit_shape(few)

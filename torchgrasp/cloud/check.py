@@ -13,6 +13,7 @@ from torchgrasp.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.values import PointCloud
 
 MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated
+FEW_POINTS = 100  # fewer points are a speck of noise, or too coarse for a shape
 
 
 @checked

@@ -11,7 +11,7 @@ from torchgrasp.base import Value
 from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
 from torchgrasp.cloud.check import remove_duplicates
-from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, nearest
+from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, is_flat, nearest
 from torchgrasp.cloud.prepare import MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.errors import BadArgument
@@ -109,7 +109,7 @@ def diagnose_cloud(
     advice = judge_view(view, clean, vertical, table, stands)
     if clean.viewpoint is not None and clean.viewpoint.ndim == 1:
         advice += judge_pixels(view, clean.viewpoint)
-    return dataclasses.replace(report, advice=(*advice, *_advise(report, clean, angle)))
+    return dataclasses.replace(report, advice=(*advice, *_advise(report, is_flat(points), angle)))
 
 
 @checked
@@ -148,11 +148,10 @@ def format_report(report: CloudReport) -> str:
     return "\n".join(f"{name:12}{text}" for name, text in lines)
 
 
-def _advise(report: CloudReport, clean: PointCloud, angle: float) -> list[Advice]:
+def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
     """Return advice on size, density, noise, outliers, flatness, normals, and a camera uncertain by `angle` [deg]."""
     longest, outliers, given = max(report.size), report.outliers / report.points, report.viewpoint_given
     voxel = 1.0 / math.sqrt(max(report.density * MAX_POINTS / report.points, 1e-12))
-    thickness, _, length = torch.linalg.svdvals((clean.points - clean.points.mean(0)).double()).sort().values.tolist()
     check = report.normals
     flipped = 0.0 if check is None else float(check.flipped.double().mean())
     cut, thin = "torchgrasp cloud cut CLOUD --out FILE", f"torchgrasp cloud thin CLOUD --voxel {voxel:.2g} --out FILE"
@@ -165,7 +164,7 @@ def _advise(report: CloudReport, clean: PointCloud, angle: float) -> list[Advice
         (outliers > 0.05, f"{outliers:.0%} of the points far from the others", f"none: {thin}"),
         (report.spacing > 0.1 * longest, sparse, "a denser cloud"),
         (report.noise > 0.003, f"{1e3 * report.noise:.1f} mm of noise, which blur the normals", "a nearer camera"),
-        (thickness < 1e-3 * length, "points all in one plane, so that the thickness is a guess", "a view of two sides"),
+        (flat, "points all in one plane, so that the thickness is a guess", "a view of two sides"),
         (bool(check and check.oriented) and flipped > 0.03, f"{flipped:.0%} flipped normals", "none: --no-normals"),
         (bool(check and not check.oriented), "normals of random signs, which are ignored", "none: --no-normals"),
         (report.viewpoint is not None and not given, guess, "--viewpoint X Y Z"),

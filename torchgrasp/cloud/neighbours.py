@@ -1,5 +1,7 @@
 """Outliers, local planes and local quadrics of a cloud, computed from the nearest neighbours of each point."""
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -34,6 +36,14 @@ def find_inliers(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = N
     """Return a mask of the given points (by default all points) that are not outliers; see `remove_outliers`."""
     spacing = nearest(points, 9, rows)[0][:, 1:].mean(-1)  # to eight: more than fly off a rim together
     return spacing <= 2.5 * spacing.median()  # the spacing of real views varies less, with depth and slope
+
+
+def is_flat(points: Float[Tensor, "n 3"]) -> bool:
+    """Return whether a cloud is no thicker than its noise: twice the error of quadrics around the points."""
+    points = points[draw_rows(len(points), 2000).to(points.device)].double()
+    points = points[find_inliers(points)]
+    thickness, _, length = (torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))).sort().values
+    return float(thickness) < max(2 * float(fit_quadrics(points)[2].median()), 1e-3 * float(length))
 
 
 def fit_planes(

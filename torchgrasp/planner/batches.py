@@ -167,7 +167,7 @@ def rank(problem: Problem, solved: Grasps) -> Grasps:
         free = 1 - collision_probability(hand, good, problem.obstacles).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
     known = torch.ones_like(solved.status, dtype=torch.bool)
-    known[solved.status == Status.OK] = is_known(problem.shape, good, problem.spec.friction) & (not problem.cut)
+    known[solved.status == Status.OK] = is_known(problem.shape, good, problem.spec.friction) & (not problem.vague)
     ranked = rank_by_success(dataclasses.replace(solved, known=known), log_odds)
     return ranked if request.order == "success" else rank_by_variance(ranked)
 

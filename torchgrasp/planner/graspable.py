@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.checks import checked
+from torchgrasp.cloud.check import FEW_POINTS
 from torchgrasp.errors import Status
 from torchgrasp.geometry.plane import to_upright, upright_frame
 from torchgrasp.geometry.support import find_table
@@ -18,8 +19,6 @@ from torchgrasp.scene.segment import OVERHANG
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
-
-LEAST_PIXELS = 100  # fewer pixels are a speck of noise, or too coarse for a shape
 
 
 @checked
@@ -54,7 +53,7 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
 def _judge(scene: Scene, points: Float[Tensor, "n 3"], label: int, spec: ContactSpec, span: float) -> Status:
     """Return the first reason why a hand of this `span` [m] cannot grasp an object; `points` have z up."""
     pixels, bounded = scene.pixels[scene.labels == label].cpu(), scene.image.bounded
-    if len(pixels) < LEAST_PIXELS:
+    if len(pixels) < FEW_POINTS:
         return Status.FEW_PIXELS
     if bounded and _is_cut(pixels, scene.image.depth.shape):
         return Status.CUT_OFF

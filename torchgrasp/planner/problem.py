@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchgrasp.base import settle
 from torchgrasp.checks import Count, Range, Seed, checked
-from torchgrasp.cloud.check import remove_duplicates
+from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
+from torchgrasp.cloud.neighbours import is_flat
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import sha256
 from torchgrasp.geometry.frames import inverse
@@ -195,10 +196,11 @@ class Problem:
         return self.surface.vertices.mean(0)
 
     @cached_property
-    def cut(self) -> bool:
-        """Whether the object is only partly in the camera's image, cut off by the image border."""
+    def vague(self) -> bool:
+        """Whether the cloud hardly shows the object: few points, one plane, or a part beyond the image border."""
         cloud = self.cloud
-        return cloud.frustum is not None and cloud.viewpoint is not None and silhouettes(cloud.to("cpu")).cut
+        cut = cloud.frustum is not None and cloud.viewpoint is not None and silhouettes(cloud.to("cpu")).cut
+        return cut or len(cloud) < FEW_POINTS or is_flat(cloud.points)
 
     @cached_property
     def obstacles(self) -> Obstacles | None:

@@ -12,11 +12,11 @@ import torch
 from torchgrasp.base import join
 from torchgrasp.checks import LEAST, Positive, Range, Seed, checked
 from torchgrasp.cloud.agreement import check_foot
-from torchgrasp.cloud.check import remove_duplicates
-from torchgrasp.cloud.neighbours import nearest
+from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
+from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
-from torchgrasp.errors import CutOff, Gap, TwoBodies
+from torchgrasp.errors import CutOff, FewPoints, Flat, Gap, TwoBodies
 from torchgrasp.geometry.plane import Plane, as_plane, round_upright, upright_frame
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.silhouette import Outlines, silhouettes
@@ -121,6 +121,12 @@ def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitO
     """Fit the shape to a cloud without duplicates in a frame whose z axis is up; `table` is the table's height [m]."""
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
+    if len(cloud) < FEW_POINTS:
+        _warn(
+            FewPoints, f"{len(cloud)} points, where a shape needs {FEW_POINTS}: the shape is a guess; give more points"
+        )
+    elif is_flat(cloud.points):
+        _warn(Flat, "the points lie in one plane, to their noise: the thickness is a guess; give a view of two sides")
     generator, noise = torch.Generator().manual_seed(seed), options.noise
     up = None if table is None else torch.tensor([0.0, 0.0, 1.0])
     seen = prepare_cloud(cloud, generator, clean=options.support == "camera", up=up)

@@ -215,6 +215,7 @@ def test_the_underside_of_a_lying_rod_is_mirrored_from_its_top():
     assert off.abs().median() < 0.002
 
 
+@pytest.mark.filterwarnings("ignore::torchgrasp.errors.Flat")
 @pytest.mark.parametrize("depth", [0.03, 0.05, 0.08])
 def test_a_box_that_shows_one_face_does_not_know_its_depth(depth: float):
     """Mirror planes of any depth hide their images, so their scores are equal: the back lies anywhere behind."""

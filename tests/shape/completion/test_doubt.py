@@ -1,4 +1,4 @@
-"""What a view does not tell: where it is cut off, has a gap, or shows two bodies, it warns and the band is wide."""
+"""What a view does not tell: it warns where the view is cut off, flat, sparse, has a gap, or shows two bodies."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ import trimesh
 from tests.make import real
 from torchgrasp import cloud_from_depth, fit_shape
 from torchgrasp.cloud import look_at, partial_view
-from torchgrasp.errors import CutOff, Gap, TwoBodies
+from torchgrasp.errors import CutOff, FewPoints, Flat, Gap, TwoBodies
 
 PATH = {"PYTHONPATH": str(Path(__file__).parents[3])}
 
@@ -101,6 +101,21 @@ def test_a_hole_that_is_seen_through_is_no_surface_and_two_bodies_are_told():
     both = trimesh.util.concatenate([BOX, other])
     with pytest.warns(TwoBodies, match="two bodies that stand apart"):
         fit_shape(partial_view(both, look_at(30.0, 40.0, target=both), n=1000), table=0.0)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_one_face_is_told_to_be_flat_and_two_faces_are_not(noise):
+    with pytest.warns(Flat, match="lie in one plane"):
+        fit_shape(partial_view(BOX, look_at(0.0, 0.0, target=BOX), n=1000, noise=noise), table=0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_shape(partial_view(BOX, look_at(0.0, 20.0, target=BOX), n=1000, noise=noise), table=0.0)
+        fit_shape(partial_view(CAN, look_at(0.0, 0.0, target=CAN), n=100, noise=noise), table=0.0)
+
+
+def test_a_cloud_of_few_points_is_told():
+    with pytest.warns(FewPoints, match="^99 points"):
+        fit_shape(partial_view(CAN, look_at(0.0, 20.0, target=CAN), n=99), table=0.0)
 
 
 def test_a_warning_names_the_line_of_the_caller(tmp_path):
