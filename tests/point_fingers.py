@@ -50,6 +50,7 @@ def reference(coupling: torch.Tensor | None = None) -> ClosingReference:
         squeeze=zero + 0.02,
         normals=NORMALS,
         gains=GAINS,
+        distance_variance=torch.full((3,), 0.004**2).double(),
     )
 
 

@@ -24,11 +24,23 @@ MAX_STEP = 0.05  # largest change [rad] of a joint in one tick; it bounds steps 
 
 
 def surface_covariance(normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the covariance [m^2] of each contact's position (Sigma_cov, Eq. 27 of the paper).
+    """Return the covariance [m^2] of each contact's position in the closing "uncertainty": n n^T s^2 + floor^2 I.
 
-    It is the shape's variance `std_m`^2 along the normal, plus the variance of the hand, equal in all directions.
+    n is the contact's normal, s the shape's deviation `std_m`; the floor is the hand's, equal in all directions.
     """
     return _normal_covariance(normals, std_m, POSITION_FLOOR)
+
+
+def printed_covariance(
+    normals: Float[Tensor, "*b 3"], distance_variance: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the covariance [m^2] that Eq. (27) of the paper prints: Sigma_cov = diag(|R f_cov n|).
+
+    `distance_variance` [m^2] is f_cov, the variance of the signed distance. `normals` are R n, in the hand's frame. A
+    normal across an axis makes Sigma_cov singular, so an entry is at least 1 mm^2.
+    """
+    entries = (distance_variance[..., None] * normals).abs()
+    return torch.diag_embed(entries.clamp_min(1e-6))
 
 
 def force_covariance(
@@ -58,9 +70,11 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
     return torch.exp(-0.5 * squared_mahalanobis(error, factor))
 
 
-def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the position gain [1/s] on each axis: a constant over the axis's variance, Eq. (27) of the paper."""
-    return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
+def position_gain(
+    covariance: Float[Tensor, "*b 3 3"], alpha_p: float = POSITION_RATE * POSITION_FLOOR**2
+) -> Float[Tensor, "*b 3"]:
+    """Return the position gain [1/s] on each axis: alpha_p [m^2/s] over the axis's variance, Eq. (27) of the paper."""
+    return alpha_p / covariance.diagonal(dim1=-2, dim2=-1)
 
 
 def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float) -> Float[Tensor, "*b 3"]:

@@ -39,13 +39,15 @@ class ClosingReference(Value):
         joints: joints of the grasp.
         squeeze: joint targets that press on the object without feedback, from `torchgrasp.control.squeeze`.
         normals: outward normals of the planned contacts.
-        gains: contacts, controller gains and desired forces (Eqs. 26-28 of the paper).
+        gains: contacts, controller gains and desired forces, of the closing "uncertainty" unless `as_printed`.
         approach: unit vector along which the opened hand moves to its pre-grasp; None means no approach.
         table: the table, which no fingertip enters while it searches, or None if it is unknown.
         surface: estimated surface of the object in the frame of the grasp (`surface_field`), with which touches are
             compared to locate the object. Without it, the tangent planes of the contacts are used.
         sensor: sensors of the fingertips.
         max_force: largest normal force [N] of a fingertip; None means no limit.
+        distance_variance: variance [m^2] of the signed distance at each contact (f_cov in Eq. 12 of the paper); None
+            if it is unknown. The closing "paper" needs it.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -67,6 +69,7 @@ class ClosingReference(Value):
     surface: SignedDistanceField | None = None
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
+    distance_variance: Float[Tensor, "f"] | None = None
 
     @classmethod
     @checked
@@ -125,7 +128,23 @@ class ClosingReference(Value):
         squeeze = forces.press(grasp.joints, jacobian, desired, forces.joint_stiffness(hand, kp)).joints
         pose, opened, joints = grasp.obj_from_hand[0], grasp.pregrasp[0], grasp.joints[0]
         stiffness, approach = forces.drive_stiffness(hand, kp), _approach_in_hand(grasp)
-        return cls(hand, stiffness, pose, opened, joints, squeeze[0], normals[0], gains, approach)
+        plan = cls(hand, stiffness, pose, opened, joints, squeeze[0], normals[0], gains, approach)
+        return dataclasses.replace(plan, distance_variance=_distance_variance(grasp))
+
+    def as_printed(self) -> "ClosingReference":
+        """Return the plan with Sigma_cov and K_P of Eqs. (26) and (27) as the paper prints them, for closing "paper".
+
+        Raises:
+            BadArgument: the plan lacks `distance_variance`.
+        """
+        if self.distance_variance is None:
+            found = "'paper' without f_cov, the variance of the signed distance [m^2]"
+            raise BadArgument("closing", found, "grasps of `plan_grasps`, whose metadata hold unit_m")
+        covariance, alpha_p = law.printed_covariance(self.normals, self.distance_variance), 4e-5  # [m^2/s]
+        gains = dataclasses.replace(
+            self.gains, covariance=covariance, position_gain=law.position_gain(covariance, alpha_p)
+        )
+        return dataclasses.replace(self, gains=gains)
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
@@ -185,6 +204,17 @@ def next_target(
     return reference.clamp(torch.minimum(torch.maximum(target + step, joints - lead), joints + lead))
 
 
+def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
+    """Return f_cov [m^2] of one grasp's contacts; `std_m`^2 without a normalised variance, None without its unit."""
+    contacts, unit_m = grasp.contacts, grasp.meta.get("unit_m")
+    if contacts.variance is None:
+        return contacts.require_std()[0] ** 2
+    try:
+        return None if unit_m is None else contacts.variance[0] * float(unit_m) ** 2
+    except ValueError:
+        raise BadArgument("grasp.meta['unit_m']", repr(unit_m), "a number of metres") from None
+
+
 def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:
     """Return the unit approach direction of one grasp in the hand's frame, or None if the grasp has no approach."""
     direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
@@ -200,7 +230,8 @@ def closing_gains(
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.
 
-    Gains and forces follow Eqs. (26)-(28) of the paper. Arguments and errors are as in `ClosingReference.from_grasp`.
+    The gains are those of the closing "uncertainty"; `ClosingReference.as_printed` has those that the paper prints.
+    Arguments and errors are as in `ClosingReference.from_grasp`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

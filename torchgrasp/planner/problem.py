@@ -257,6 +257,7 @@ class Problem:
             "finger_names": ",".join(hand.finger_names),
             "frames": "obj: the frame of the cloud; hand: the base link of the hand's URDF; a_from_b maps b into a",
             "units": "metre, radian",
+            "unit_m": repr(float(self.shape.scale)),
             "friction": f"{spec.friction:g}",
             "planned_friction": f"{spec.planned_friction:g}",
             "table": "none" if spec.plane is None else spec.plane.describe(),

@@ -36,7 +36,7 @@ class PaperClosing:
     palm = STILL
 
     def __init__(self, reference: ClosingReference) -> None:
-        self.reference, self.target = reference, reference.pregrasp
+        self.reference, self.target = reference.as_printed(), reference.pregrasp
         self.lead = strongest_lead(reference)
         self.share = torch.zeros_like(reference.normals[:, 0])
         self.settled = Settled(reference)
