@@ -20,7 +20,7 @@ from tests.point_fingers import (
 )
 from torchgrasp import Plane
 from torchgrasp.closure import NO_OPTIONS, ClosingOptions
-from torchgrasp.control import ClosingReference, GraspController, Observation
+from torchgrasp.control import ClosingReference, GraspController
 from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, position_gain, surface_covariance
 from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing, PositionClosing
 from torchgrasp.control.sensing import WAITING_FORCE

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.make import directions, real
-from tests.point_fingers import FREE, NORMALS, TARGET, TOUCHING, observation, reference
+from tests.make import real
+from tests.point_fingers import NORMALS, TARGET, TOUCHING, observation, reference
 from torchgrasp import ClosingReference, load_hand
 from torchgrasp.control import GraspController, no_contact, observe
 from torchgrasp.control.forces import joint_stiffness
