@@ -108,7 +108,7 @@ def test_the_papers_law_needs_the_variance_of_the_signed_distance():
     plan = ClosingReference.from_grasp(hand, dataclasses.replace(grasp, meta=unknown))
     assert plan.distance_variance is None
     GraspController(plan)
-    with pytest.raises(BadArgument, match="closing: expected .*unit_m.*got 'paper' without f_cov"):
+    with pytest.raises(BadArgument, match=r"closing: expected .*unit_m.*got 'paper' without f_cov"):
         GraspController(plan, "paper")
     with pytest.raises(BadArgument, match=r"unit_m.*metres.*got 'wide'"):
         ClosingReference.from_grasp(hand, dataclasses.replace(grasp, meta=unknown | {"unit_m": "wide"}))
