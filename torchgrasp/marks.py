@@ -164,7 +164,7 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
     given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
     allowed = "a device, torch.float32 or torch.float64"
     try:
-        moved = torch.empty(0, dtype=torch.float32).to(*args, **kwargs)
+        moved = torch.empty(0, dtype=torch.float32, device="cpu").to(*args, **kwargs)
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:
         raise BadArgument("to", given, allowed) from error
     if moved.is_meta or moved.dtype not in DTYPES["Float"]:

@@ -64,7 +64,7 @@ def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
     """Raise `BrokenLaw` if the Jacobian differs from central differences, or a row of a batch from a single posture."""
     # Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian
     step, allowed = 1e-6, 1e-6
-    steps = step * torch.eye(hand.dof, dtype=torch.float64)
+    steps = step * torch.eye(hand.dof, dtype=torch.float64, device="cpu")
     after, before = (hand.fingertips(joints[:, None] + sign * steps)[0] for sign in (1, -1))
     error = ((after - before) / (2 * step) - hand.jacobian(joints).movedim(-1, 1)).abs().amax((0, 2, 3))
     if not float(error.max()) < allowed:
@@ -89,7 +89,7 @@ def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Itera
 
 def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
     """Return n random postures, uniform within the joint limits [rad]."""
-    share = torch.rand(n, hand.dof, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    share = torch.rand(n, hand.dof, generator=torch.Generator().manual_seed(seed), dtype=torch.float64, device="cpu")
     return hand.lower + (hand.upper - hand.lower) * share
 
 

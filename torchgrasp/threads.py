@@ -1,4 +1,8 @@
-"""Calls that use one torch thread: on busy cores several threads mostly wait for each other."""
+"""Calls that use one torch thread, and the CPU where no device is named.
+
+On busy cores several threads mostly wait for each other. A default device that a user sets must not move tensors that
+the library makes, such as random draws.
+"""
 
 import contextlib
 import functools
@@ -18,7 +22,7 @@ _state = {"calls": 0, "before": 1}
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread within the context, and restore the number of threads afterwards."""
+    """Let torch use one thread, and the CPU by default, within the context; restore both afterwards."""
     if getattr(_here, "inside", False):
         yield
         return
@@ -29,7 +33,8 @@ def one_thread() -> Iterator[None]:
     _here.inside = True
     torch.set_num_threads(1)
     try:
-        yield
+        with contextlib.nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
+            yield
     finally:
         with _lock:
             _state["calls"] -= 1
@@ -38,7 +43,7 @@ def one_thread() -> Iterator[None]:
 
 
 def single_threaded(function: Function) -> Function:
-    """Return the function limited to one torch thread; a generator is limited while it computes each item."""
+    """Return the function, which runs within `one_thread`; a generator, while it computes each item."""
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

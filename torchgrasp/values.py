@@ -288,10 +288,10 @@ def check_grasps(path: Path | str, grasps: Grasps) -> None:
     """Raise `ModelFileError` if grasps from a file cannot have been written by `Grasps.save`."""
     f = grasps.contacts.fingertips
     wrong = {
-        f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]]),
+        f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]], device="cpu"),
         "obj_from_hand that is not rigid": ~is_rigid(grasps.obj_from_hand),
-        "an unknown status": ~torch.isin(grasps.status, torch.tensor([int(status) for status in Status])),
-        "a permutation that is none": (grasps.permutation.sort(1).values != torch.arange(f)).any(1),
+        "an unknown status": ~torch.isin(grasps.status, torch.tensor([int(status) for status in Status], device="cpu")),
+        "a permutation that is none": (grasps.permutation.sort(1).values != torch.arange(f, device="cpu")).any(1),
     }
     for found in (name for name, rows in wrong.items() if bool(rows.any())):
         raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")

@@ -103,7 +103,7 @@ def press(
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
     """Return the drive stiffness [N m/rad] of every joint of the URDF: `kp` if given, else the hand's own."""
     kps = [hand.actuators[name].kp if kp is None else kp for name in hand.tree.joint_names]
-    return torch.tensor(kps, dtype=torch.float64)
+    return torch.tensor(kps, dtype=torch.float64, device="cpu")
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:

@@ -44,7 +44,7 @@ def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
 
 def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:
     """Return n unit vectors spread over the sphere, from +z to -z; vector k has the azimuth `angle` * (k + `start`)."""
-    k = torch.arange(n, dtype=torch.float64)
+    k = torch.arange(n, dtype=torch.float64, device="cpu")
     z = 1 - (2 * k + 1) / n
     rotation = angle * (k + start)
     ring = torch.sqrt(1 - z * z)

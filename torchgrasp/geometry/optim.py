@@ -67,7 +67,7 @@ def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int
 
     Every problem takes at most `steps` steps, each with one evaluation. No gradient flows through the minimisation.
     """
-    whole, rows = state, torch.arange(len(state))
+    whole, rows = state, torch.arange(len(state), device="cpu")
     model = problem.linearise(state, rows)
     costs = model.cost
     rows, damping = rows.to(model.cost.device), torch.full_like(model.cost, problem.first_damping)

@@ -59,7 +59,7 @@ class Plane(Value):
     @checked
     def horizontal(cls, height: float) -> "Plane":
         """Return the plane z = height [m]."""
-        return cls(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), float(height))
+        return cls(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu"), float(height))
 
     @checked(gradients=True)
     def height(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:

@@ -18,7 +18,7 @@ MOST_TILT = 30.0  # greatest angle [deg] between the normal and `up`
 
 def assume_noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -> Float[Tensor, "n"]:
     """Return the assumed noise [m] of each point. If the camera is unknown, its distance is taken as 0.7 m."""
-    squared = torch.full((len(points),), 0.7**2, dtype=points.dtype)
+    squared = torch.full((len(points),), 0.7**2, dtype=points.dtype, device="cpu")
     return NOISE + NOISE_GROWTH * (squared if eye is None else (points - eye).square().sum(-1))
 
 
@@ -58,7 +58,7 @@ def fit_planes(view: View, generator: torch.Generator) -> Iterator[PlaneFit]:
     points, noise = view.points[:scored], view.noise[:scored]
     normals, offsets = _propose(view, scored, generator)
     held = _held(points, noise, normals, offsets)
-    left = torch.ones(len(points))
+    left = torch.ones(len(points), device="cpu")
     for _ in range(8 if len(held) else 0):
         counts = held @ left
         i = int(counts.argmax())
@@ -76,8 +76,8 @@ def _propose(view: View, scored: int, generator: torch.Generator) -> tuple[Float
     points = view.points
     some = points[:scored]
     near = torch.from_numpy(KDTree(some.numpy()).query(some.numpy(), min(60, len(some)))[1])
-    pick = torch.randint(near.shape[1], (2, len(some), 1), generator=generator)
-    far = points[torch.randint(len(points), (3, 4000), generator=generator)]
+    pick = torch.randint(near.shape[1], (2, len(some), 1), generator=generator, device="cpu")
+    far = points[torch.randint(len(points), (3, 4000), generator=generator, device="cpu")]
     a, b, c = torch.cat([far, torch.stack([some, *(some[near.gather(1, k)[:, 0]] for k in pick)])], 1)
     normal = torch.linalg.cross(b - a, c - a)
     double_area = torch.linalg.vector_norm(normal, dim=-1)
@@ -95,8 +95,8 @@ def _held(
     points: Float[Tensor, "n 3"], noise: Float[Tensor, "n"], normals: Float[Tensor, "m 3"], offsets: Float[Tensor, "m"]
 ) -> Float[Tensor, "m n"]:
     """Return a matrix of planes by points: 1 if the point is within twice its noise of the plane, else 0."""
-    held = torch.empty(len(normals), len(points))
-    for rows in torch.arange(len(normals)).split(500):
+    held = torch.empty(len(normals), len(points), device="cpu")
+    for rows in torch.arange(len(normals), device="cpu").split(500):
         held[rows] = ((normals[rows] @ points.T - offsets[rows, None]).abs_() < 2 * noise).float()
     return held
 

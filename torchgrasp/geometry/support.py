@@ -116,7 +116,7 @@ def find_supports(
     if len(points) < 50:
         raise NoSupport("table", f"{len(points)} points", SUPPORT)
     generator = torch.Generator().manual_seed(seed)
-    points = points[torch.randperm(len(points), generator=generator)[:20_000]]
+    points = points[torch.randperm(len(points), generator=generator, device="cpu")[:20_000]]
     centre = points.mean(0)
     points = points - centre  # so that distant origins cost no digits
     view = View(points, None if eye is None else eye - centre, sky)

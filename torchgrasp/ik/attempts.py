@@ -172,7 +172,7 @@ class CobylaRun:
         frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())
         tips = self.tips(frames)
         if bool(degenerate(tips)):
-            return joints, frames, torch.eye(4).to(tips), False
+            return joints, frames, torch.eye(4, device="cpu").to(tips), False
         return joints, frames, virtual_frame(self.points) @ inverse(virtual_frame(tips)), True
 
     def tips(self, frames: Float[Tensor, "3 4 l 1"]) -> Float[Tensor, "3 3"]:

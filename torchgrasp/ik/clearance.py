@@ -64,7 +64,7 @@ class Obstacles(Value):
         distances = torch.stack([distance_to(probability >= level, occupancy.spacing) for level in levels])
         outside, inside = distances[levels.index(full)], distance_to(probability < full, occupancy.spacing)
         field = SignedDistanceField(occupancy.origin.double(), occupancy.spacing, outside - inside)
-        return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64), hard).to(device)
+        return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64, device="cpu"), hard).to(device)
 
     @checked(gradients=True)
     def likelihood(self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]) -> Float[Tensor, "*b"]:
@@ -82,7 +82,7 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
     from scipy.ndimage import distance_transform_edt
 
     if not bool(region.any()):
-        return torch.full(region.shape, spacing * sum(region.shape), dtype=torch.float64)
+        return torch.full(region.shape, spacing * sum(region.shape), dtype=torch.float64, device="cpu")
     steps = torch.from_numpy(np.asarray(distance_transform_edt(~region.numpy())))
     return (spacing * (steps - 0.5)).clamp_min(0.0)
 

@@ -17,7 +17,7 @@ from torchgrasp.values import Grasps
 
 APPROACH_DISTANCE = 0.1  # length [m] of the straight approach: about the depth of a hand
 COARSE_STEPS, FINE_STEPS = 8, 16  # positions on each candidate path, and on a chosen path
-UP = torch.tensor([0.0, 0.0, 1.0])
+UP = torch.tensor([0.0, 0.0, 1.0], device="cpu")
 Spheres = Float[Tensor, "g s 3"]
 
 
@@ -49,7 +49,7 @@ def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) 
     axis = unit(hand.approach.to(pose))
     first, second = across(axis)
     tilt, directions = math.radians(45), 8
-    angle = torch.arange(directions).to(axis)[:, None] * (2 * math.pi / directions)
+    angle = torch.arange(directions, device="cpu").to(axis)[:, None] * (2 * math.pi / directions)
     tilted = math.cos(tilt) * axis + math.sin(tilt) * (torch.cos(angle) * first + torch.sin(angle) * second)
     directions = rotate(pose, torch.cat([axis[None], tilted]).expand(len(pose), -1, -1))
     if table is None:
@@ -98,7 +98,7 @@ def collision_probability(hand: Hand, grasps: Grasps, obstacles: Obstacles) -> F
     """
     configuration = Configuration(grasps.joints, grasps.obj_from_hand)
     opened = _centres(hand, Configuration(grasps.pregrasp, grasps.obj_from_hand))
-    back = torch.arange(1, COARSE_STEPS + 1).to(opened) * (APPROACH_DISTANCE / COARSE_STEPS)
+    back = torch.arange(1, COARSE_STEPS + 1, device="cpu").to(opened) * (APPROACH_DISTANCE / COARSE_STEPS)
     approach = opened[:, None] - back[:, None, None] * grasps.approach[:, None, None]
     closing, lift = _closing(hand, configuration, grasps.pregrasp), _lift(hand, configuration, UP)
     centres = torch.cat([approach, closing, lift], 1)
@@ -114,7 +114,7 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> floa
 
 def _closing(hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"]) -> Float[Tensor, "g k s 3"]:
     """Return the centres [m] of the collision spheres at k postures, in equal steps from pre-grasp to grasp."""
-    shares = torch.linspace(0, 1, 6).tolist()
+    shares = torch.linspace(0, 1, 6, device="cpu").tolist()
     postures = [torch.lerp(pregrasp, configuration.joints, share) for share in shares]
     return torch.stack([_centres(hand, Configuration(x, configuration.obj_from_hand)) for x in postures], 1)
 
@@ -126,7 +126,7 @@ def _lift(hand: Hand, configuration: Configuration, up: Float[Tensor, "3"]) -> F
 
 def _lifted(points: Float[Tensor, "*b 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "k *b 3"]:
     """Return points [m] at six heights of a lift by 0.1 m along `up`."""
-    height = torch.arange(1, 7).to(points) * (0.1 / 6)
+    height = torch.arange(1, 7, device="cpu").to(points) * (0.1 / 6)
     return points + (height[:, None] * up.to(points)).reshape(-1, *[1] * (points.ndim - 1), 3)
 
 

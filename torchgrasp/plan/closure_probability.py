@@ -56,7 +56,7 @@ class LinePosterior(Batch):
 @functools.cache
 def grid() -> Float[Tensor, "23"]:
     """Return the 23 grid positions on a line, in standard deviations, from outside to inside."""
-    return torch.tensor([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64)
+    return torch.tensor([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64, device="cpu")
 
 
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
@@ -108,7 +108,7 @@ def _along_lines(
     """Return, on lines along the normals: standard deviations, mean distances, mean gradients and covariances."""
     jet = shape.jet(points.flatten(0, 1))
     deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
-    nodes = deviation[..., None] * torch.tensor(NODES).to(deviation)
+    nodes = deviation[..., None] * torch.tensor(NODES, device="cpu").to(deviation)
     values = 4 * len(NODES) * points.shape[1]
     covariance = points.new_empty(len(points), values, values)
     for rows in torch.arange(len(points), device=points.device).split(32):  # the distances of a part stay in the cache
@@ -150,7 +150,7 @@ def first_contact(lines: LinePosterior, drawn: Float[Tensor, "b n z"]) -> tuple[
     `drawn` holds the deviations of the random surfaces from the mean, at the nodes of the lines.
     """
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
-    t, nodes = grid().to(drawn), torch.tensor(NODES).to(drawn)
+    t, nodes = grid().to(drawn), torch.tensor(NODES, device="cpu").to(drawn)
     distance = lines.distance[:, None] + deviation[..., 0] @ interpolation(t, nodes).T
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
     far = torch.where(crosses, t[:-1].abs(), torch.inf)
@@ -231,7 +231,8 @@ def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Fl
     guess = None if lines.points.shape[1] == 3 else first_balance(lines.points, lines.normals, friction)
     at_once, judged = min(n, draws_per_chunk), draws_per_chunk if count.device.type == "cpu" else gpu_draws
     for start in range(0, n, at_once):
-        standard = torch.randn(min(at_once, n - start), lines.root.shape[-1], dtype=torch.float64, generator=generator)
+        size = min(at_once, n - start), lines.root.shape[-1]
+        standard = torch.randn(size, dtype=torch.float64, generator=generator, device="cpu")
         for rows in torch.arange(len(lines), device=count.device).split(max(judged // len(standard), 1)):
             points, normals = first_contact(lines[rows], standard.to(count) @ lines.root[rows])
             balance = None if guess is None else guess[rows].repeat_interleave(len(standard), 0)

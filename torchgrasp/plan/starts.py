@@ -104,7 +104,7 @@ def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
 
 def draw(shape: Shape, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
     """Return random points on the sphere of `spec.start_radius`, in normalised units; `size` is (sets, contacts)."""
-    points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64))
+    points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64, device="cpu"))
     return (spec.start_radius * points).to(device_of(shape))
 
 
@@ -153,8 +153,9 @@ def candidate_rows(
     If too few of the drawn sets are such, the rest are any candidates.
     """
     rows, missing, f = [], starts, problem.fingertips
+    drawn = DRAWN_PER_START * starts, f
     for _ in range(ROUNDS):
-        choice = torch.randint(len(points), (DRAWN_PER_START * starts, f), generator=generator).to(points.device)
+        choice = torch.randint(len(points), drawn, generator=generator, device="cpu").to(points.device)
         apart = torch.linalg.vector_norm(problem.sides(points[choice], normals[choice]), dim=-1).amin(-1)
         choice = choice[apart > problem.separation]
         closed = choice[closed_exact(points[choice], normals[choice], problem.friction)][:missing]
@@ -162,5 +163,5 @@ def candidate_rows(
         missing -= len(closed)
         if missing == 0:
             break
-    rows.append(points[torch.randint(len(points), (missing, f), generator=generator).to(points.device)])
+    rows.append(points[torch.randint(len(points), (missing, f), generator=generator, device="cpu").to(points.device)])
     return torch.cat(rows), starts - missing

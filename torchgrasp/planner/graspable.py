@@ -105,7 +105,7 @@ def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:
 def hand_span(hand: Hand) -> float:
     """Return the widest grasp [m]: the largest distance of two pads that face each other, over random postures."""
     if "span" not in hand.derived:
-        draw = torch.rand(5000, hand.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        draw = torch.rand(5000, hand.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu")
         pads, normals = hand.fingertips(hand.lower + draw.to(hand.lower) * (hand.upper - hand.lower))
         way = pads[:, None] - pads[:, :, None]
         distance = torch.linalg.vector_norm(way, dim=-1)

@@ -264,7 +264,7 @@ def no_grasps(hand: Hand) -> Grasps:
     f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:
-        return torch.zeros(0, *shape, dtype=torch.float64)
+        return torch.zeros(0, *shape, dtype=torch.float64, device="cpu")
 
     contacts = Contacts(none(f, 3), none(f, 3), none(f), none(f))
     certificate = Certificate(none(), none(), none(), none().bool(), none(6))

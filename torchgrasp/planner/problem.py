@@ -285,7 +285,7 @@ def take_target(scene: Scene, seed: Seed) -> PointCloud:
     if scene.target not in scene.things:
         raise BadArgument("target", scene.target, f"one of the labels {list(scene.things)}: scene.select(label)")
     cloud, generator = scene.cloud(), torch.Generator().manual_seed(seed)
-    rows = torch.randperm(len(cloud), generator=generator)[:TARGET_POINTS].sort().values
+    rows = torch.randperm(len(cloud), generator=generator, device="cpu")[:TARGET_POINTS].sort().values
     return cloud.select(rows.to(cloud.points.device))
 
 

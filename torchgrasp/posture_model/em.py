@@ -222,7 +222,7 @@ def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]
     x, lengths = shard.rows, shard.rows.new_zeros(shard.processes, dtype=torch.int64)
     lengths[shard.rank] = len(x)
     lengths = shard.sum(lengths)
-    order = torch.randperm(int(lengths.sum()), generator=generator)  # the same for any number of processes
+    order = torch.randperm(int(lengths.sum()), generator=generator, device="cpu")  # for any number of processes
     pick = order[:20_000].to(x.device) - lengths[: shard.rank].sum()  # some hundred for each component
     here = (pick >= 0) & (pick < len(x))
     pool = x.new_zeros(len(pick), x.shape[1])

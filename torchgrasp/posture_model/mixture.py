@@ -65,7 +65,7 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     flat = degenerate(ordered_points).any(1)  # in any order: at the threshold rounding may distinguish them
     bad = flat[:, None, None]
     # A degenerate row gets another triangle, so that one call frames all rows.
-    ordered_points = torch.where(bad[..., None], torch.eye(3).to(points), ordered_points)
+    ordered_points = torch.where(bad[..., None], torch.eye(3, device="cpu").to(points), ordered_points)
     return ContactCode(
         q=torch.where(bad, torch.nan, encode_fingertips(ordered_points, ordered_normals)),
         obj_from_vf=torch.where(bad[..., None], torch.nan, virtual_frame(ordered_points)),
@@ -88,7 +88,7 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
         return
     ours = _probe_codes(hand).flatten()
     try:
-        theirs = torch.tensor([float(x) for x in meta["hand_codes"].split()], dtype=torch.float64)
+        theirs = torch.tensor([float(x) for x in meta["hand_codes"].split()], dtype=torch.float64, device="cpu")
     except ValueError as error:
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
     if theirs.shape != ours.shape or not torch.allclose(
@@ -103,7 +103,7 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
     """Return the contact codes of three fixed postures, Eqs. (15)-(18) of the paper; they identify the hand."""
     lower, upper = hand.lower.double(), hand.upper.double()
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
-    index = (torch.arange(hand.dof)[None] + torch.arange(3)[:, None]) % 3
+    index = (torch.arange(hand.dof, device="cpu")[None] + torch.arange(3, device="cpu")[:, None]) % 3
     return encode_fingertips(*hand.fingertips(lower + share[index] * (upper - lower)))
 
 

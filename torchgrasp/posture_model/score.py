@@ -136,4 +136,5 @@ def bic_curve(
         mixture = fit_mixture(samples, m, checkpoint=checkpoint, **fit)
         criterion.append(float(mixture.meta["bic"]))
         observer(m, mixture)
-    return BicCurve(torch.tensor(list(components)), torch.tensor(criterion, dtype=torch.float64))
+    found = torch.tensor(criterion, dtype=torch.float64, device="cpu")
+    return BicCurve(torch.tensor(list(components), device="cpu"), found)
