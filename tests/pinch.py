@@ -11,6 +11,7 @@ import trimesh
 from tests.make import run_python
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.geometry.frames import rigid, rotate, rotation_from_vector
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Certificate, Contacts, Grasps
@@ -66,6 +67,7 @@ def pinch(name):
         certificate=Certificate(one, one, 0 * one, torch.tensor([True]), torch.zeros(1, 6)),
         score=one,
         status=torch.zeros(1, dtype=torch.int64),
+        meta={"table": Plane.horizontal(0.0).describe()},
     )
 
 

@@ -141,6 +141,8 @@ HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
 class TrialSpec(Value):
     """Parameters of a simulated trial: close the hand on the true object, lift it off the table, hold it.
 
+    The controller does not know `mass`, `density`, `friction`, `gravity`, `patch` and the numbers of the simulator.
+
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
             "uncertainty": the same control law with further components (`ClosingOptions`). "fixed": "uncertainty" with

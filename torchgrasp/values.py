@@ -19,6 +19,7 @@ from torchgrasp.base import FINGERTIPS, Batch, Value, named_tensors, read_rows
 from torchgrasp.checks import ANY, Poses, Rows, checked, is_rigid
 from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import read_value, save_tensors
+from torchgrasp.geometry.plane import Plane, read_plane
 
 
 @checked
@@ -249,6 +250,12 @@ class Grasps(Batch):
         likely = torch.sigmoid(self.score)
         likely = likely if self.known is None else torch.where(self.known, likely, torch.nan)
         return torch.where(self.status == Status.OK, likely, 0.0)
+
+    @property
+    def table(self) -> Plane | None:
+        """The table that the planner was given, in the frame of the grasps; None if it had none, or is unknown."""
+        text = self.meta.get("table", "none")
+        return None if text == "none" else read_plane(text)
 
     @checked
     def save(self, path: Path | str) -> None:

@@ -33,7 +33,7 @@ from torchgrasp.control import ClosingReference
 from torchgrasp.control.paper.closings import Impedance
 from torchgrasp.control.paper.stability import FILE, NAMES, StabilityModel, lengths_of, state_of
 from torchgrasp.errors import BadArgument, GraspError
-from torchgrasp.evaluation.trial import GraspTrial
+from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
@@ -130,7 +130,7 @@ def pull_once(
     error = rigid(rotation_from_vector(TURN * off[:3]), SHIFT * off[3:])
     reference = ClosingReference.from_grasp(hand, grasp, strength)
     holding = functools.partial(Impedance, springs=springs)
-    trial, pull = GraspTrial(hand, grasp, mesh, seed, error, parts=parts), RisingPull(direction, most / 0.3, most, 0.8)
+    trial, pull = GraspTrial(hand, grasp, Truth(mesh, parts, error), seed), RisingPull(direction, most / 0.3, most, 0.8)
     return pull_until_lost(trial, reference, holding, pull, friction)
 
 

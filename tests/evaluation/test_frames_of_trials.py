@@ -23,7 +23,7 @@ def moved(grasp, b_from_a):
     )
     approach = rotate(b_from_a, grasp.approach[:, None])[:, 0]
     return dataclasses.replace(
-        grasp, contacts=contacts, approach=approach, obj_from_hand=b_from_a @ grasp.obj_from_hand
+        grasp, contacts=contacts, approach=approach, obj_from_hand=b_from_a @ grasp.obj_from_hand, meta={}
     )
 
 
@@ -36,7 +36,8 @@ def trial(b_from_a, simulator, **options):
     mesh, box = (body.copy().apply_transform(b_from_a.numpy()) for body in (cylinder(), box))
     spec = dataclasses.replace(QUICK, simulator=simulator, **options)
     rest = {"error": ERROR, "parts": [mesh], "neighbours": [Neighbour(box, [box])]}
-    return close_hand(moved(grasp, b_from_a), hand, mesh, spec, table=Plane.horizontal(0.0).moved(b_from_a), **rest)
+    table = Plane.horizontal(0.0).moved(b_from_a)
+    return close_hand(moved(grasp, b_from_a), hand, mesh, spec, table=table, told=table, **rest)
 
 
 @pytest.mark.parametrize(("simulator", "seed"), [("sapien", 0), ("mujoco", 1)])

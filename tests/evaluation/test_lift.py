@@ -13,7 +13,7 @@ from torchgrasp import Plane, TrialSpec, load_hand
 from torchgrasp.closure import ClosingOptions
 from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
-from torchgrasp.evaluation import GraspTrial, close_hand
+from torchgrasp.evaluation import GraspTrial, Truth, close_hand
 from torchgrasp.evaluation.lift import LIFT_TIME, _Lift, lift_grasp
 from torchgrasp.evaluation.score import most_certain_first
 from torchgrasp.evaluation.trial import TrialDriver, derive_reference
@@ -102,7 +102,7 @@ def test_the_papers_closings_lift_what_stands_where_it_was_seen(closing):
 
 def test_the_papers_forces_are_those_of_the_stability_model():
     hand, grasp = pinch("barrett")
-    sources = {c: derive_reference(hand, grasp, TrialSpec(closing=c)).gains.force_source for c in ("paper", "fixed")}
+    sources = {c: derive_reference(hand, grasp, closing=c).gains.force_source for c in ("paper", "fixed")}
     assert sources == {"paper": "stability", "fixed": "analytic"}
 
 
@@ -143,7 +143,7 @@ def test_the_palm_follows_an_object_that_stands_elsewhere():
 
 def test_an_object_that_slips_in_the_hand_is_not_held(monkeypatch):
     pytest.importorskip("sapien")
-    trial = _Lift(TrialDriver(GraspTrial(*pinch("allegro"), cylinder((0.0, 0.008))), QUICK).open())
+    trial = _Lift(TrialDriver(GraspTrial(*pinch("allegro"), Truth(cylinder((0.0, 0.008)))), QUICK).open())
     assert trial.perform() is Status.OK
     slipped = trial.result(Status.OK, 0.0).slip
     for name, limit in (("SLIP_DISTANCE", slipped.distance), ("SLIP_ANGLE", slipped.angle)):
@@ -181,7 +181,7 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
     """At rest the tips carry the object: their full forces sum to its weight, their normal parts are the readings."""
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
-    run = TrialDriver(GraspTrial(hand, grasp, cylinder()), TrialSpec(approach=0.0, noise=False)).open()
+    run = TrialDriver(GraspTrial(hand, grasp, Truth(cylinder())), TrialSpec(approach=0.0, noise=False)).open()
     for _ in run.close():
         pass
     for k in range(200):
@@ -203,7 +203,7 @@ def test_a_start_in_the_object_missing_contact_and_too_little_friction_are_named
     forward[2, 3] = 0.2
     inside = close("barrett", spec=spec, error=forward)
     assert (inside.status, inside.held, len(inside.time)) == (Status.START_OVERLAP, False, 1)
-    missed = lift_grasp(GraspTrial(hand, grasp, cylinder((0.4, 0.0))), spec)
+    missed = lift_grasp(GraspTrial(hand, grasp, Truth(cylinder((0.4, 0.0)))), spec)
     assert (missed.status, missed.contact_order) == (Status.NO_CONTACT, ())
     slippery = close("allegro", spec=dataclasses.replace(spec, friction=0.02))
     assert slippery.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED) and not slippery.held

@@ -74,13 +74,13 @@ def test_a_start_inside_a_neighbour_is_refused_but_neighbours_may_touch_the_tabl
 
 def test_neighbours_weigh_what_they_are_given_and_are_checked():
     pytest.importorskip("sapien")
-    from torchgrasp.evaluation import GraspTrial
+    from torchgrasp.evaluation import GraspTrial, Truth
     from torchgrasp.evaluation.trial import TrialDriver
     from torchgrasp.specs import TrialSpec
 
     hand, grasp = pinch("allegro")
     around = [Neighbour(box((0.3, 0.3))), Neighbour(box((-0.3, 0.3)), mass=0.5)]
-    driver = TrialDriver(GraspTrial(hand, grasp, cylinder(), neighbours=around), TrialSpec(density=300.0))
+    driver = TrialDriver(GraspTrial(hand, grasp, Truth(cylinder(), neighbours=around)), TrialSpec(density=300.0))
     masses = [body.mass for body in driver.scene_spec.neighbours]
     assert masses == [pytest.approx(300 * 0.04 * 0.04 * 0.06), 0.5]
     scene = driver.open().scene

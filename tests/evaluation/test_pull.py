@@ -11,7 +11,7 @@ from tests.pinch import cylinder, pinch
 from torchgrasp.control import squeeze
 from torchgrasp.control.forces import joint_stiffness
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, pull_grasp
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, pull_grasp
 from torchgrasp.geometry.frames import apply, inverse
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
@@ -25,7 +25,7 @@ def pull(name, pull=PULL, **changes):
     pytest.importorskip("sapien")
     hand, grasp = pinch(name)
     protocol = dataclasses.replace(QUICK, pull=pull).with_trial(**changes)
-    return pull_grasp(GraspTrial(hand, grasp, cylinder()), protocol)
+    return pull_grasp(GraspTrial(hand, grasp, Truth(cylinder())), protocol)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -78,17 +78,17 @@ def test_a_controller_closes_and_holds(closing):
 
 def test_a_hand_inside_the_object_is_refused_and_one_beside_it_misses_it():
     hand, grasp = pinch("barrett")
-    result = pull_grasp(GraspTrial(hand, grasp, cylinder((0.0, 0.05))), QUICK.with_trial(overlap=1e-3))
+    result = pull_grasp(GraspTrial(hand, grasp, Truth(cylinder((0.0, 0.05)))), QUICK.with_trial(overlap=1e-3))
     assert result.status is Status.START_OVERLAP and result.directions == 1 and math.isnan(result.force)
     aside = torch.eye(4, dtype=torch.float64)
     aside[2, 3] = 0.2
     hand, grasp = pinch("allegro")
-    assert not pull_grasp(GraspTrial(hand, grasp, cylinder(), error=aside), QUICK).passed
+    assert not pull_grasp(GraspTrial(hand, grasp, Truth(cylinder(), error=aside)), QUICK).passed
 
 
 def test_bad_arguments_are_named():
     hand, grasp = pinch("allegro")
-    trial = GraspTrial(hand, grasp, cylinder())
+    trial = GraspTrial(hand, grasp, Truth(cylinder()))
     for protocol, message in (
         ("best", "protocol: expected .*got 'best'"),
         ("paper", "protocol: expected .*got 'paper', which lifts"),
@@ -102,6 +102,6 @@ def test_bad_arguments_are_named():
     with pytest.raises(BadArgument, match=r"grasp\.pregrasp: expected .*got 9 for"):
         pull_grasp(dataclasses.replace(trial, grasp=dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9)))
     with pytest.raises(BadArgument, match=r"error: expected .*got"):
-        pull_grasp(dataclasses.replace(trial, error=torch.full((4, 4), math.nan)))
+        Truth(cylinder(), error=torch.full((4, 4), math.nan))
     with pytest.raises(BadArgument, match=r"grasps: expected .*got 12 joints"):
         squeeze(pinch("barrett")[0], grasp)

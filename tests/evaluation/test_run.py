@@ -16,7 +16,7 @@ from torchgrasp.app import cli
 from torchgrasp.control import ClosingOptions
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PoseNoise, Protocol, evaluate, views
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PoseNoise, Protocol, Truth, evaluate, views
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.score import STAGES, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, choose_rows
@@ -163,7 +163,7 @@ def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(folder, t
 def test_a_pinched_cylinder_is_lifted():
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
-    trial = GraspTrial(hand, grasp, cylinder(), parts=[cylinder()])
+    trial = GraspTrial(hand, grasp, Truth(cylinder(), [cylinder()]))
     found = run_protocol(trial, Protocol("quick", QUICK))
     assert found.passed and found.status is Status.OK and found.force > 1.0 and found.moved < 0.01
     assert 0.0 <= found.overlap < 0.003

@@ -11,7 +11,7 @@ import trimesh
 from tests.pinch import QUICK, close, cylinder, pinch, quick_trial
 from torchgrasp import load_hand
 from torchgrasp.errors import HandFileError, Status
-from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
 from torchgrasp.sim.scene_spec import SceneSpec, pair_masks
 from torchgrasp.sim.simulated_hand import open_scene
 
@@ -76,7 +76,7 @@ def test_trial_refuses_a_hand_that_starts_in_itself():
         1000, hand.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
     crossed = joints[hand.self_clearance(joints).argmin()][None]
-    trial = GraspTrial(hand, dataclasses.replace(grasp, pregrasp=crossed), cylinder((1.0, 0.0)))
+    trial = GraspTrial(hand, dataclasses.replace(grasp, pregrasp=crossed), Truth(cylinder((1.0, 0.0))))
     for on in (True, False):
         run = TrialDriver(trial, dataclasses.replace(QUICK, table=False, self_collision=on)).open()
         assert run.starts is not on

@@ -7,7 +7,7 @@ import pytest
 
 from tests.pinch import QUICK, close, cylinder, pinch, quick_trial
 from torchgrasp import Status, close_hand
-from torchgrasp.evaluation import PROTOCOLS, GraspTrial, pull_grasp
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, Truth, pull_grasp
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 PULL = PROTOCOLS["dexgraspbench"].with_trial(mass=0.05)
@@ -33,7 +33,7 @@ def test_simulators_hold_a_cylinder_with_equal_forces(name):
 @pytest.mark.parametrize("pull", [10.0, 300.0])
 def test_simulators_agree_on_a_pull(pull):
     hand, grasp = pinch("allegro")
-    trial = GraspTrial(hand, grasp, cylinder())
+    trial = GraspTrial(hand, grasp, Truth(cylinder()))
     protocol = dataclasses.replace(PULL, pull=dataclasses.replace(PULL.pull, acceleration=pull))
     there, here = (pull_grasp(trial, protocol.with_trial(simulator=s)) for s in ("sapien", "mujoco"))
     assert there.passed == here.passed == (pull < 100)
@@ -58,9 +58,9 @@ def test_simulators_never_hold_a_diverged_or_overlapping_trial(simulator, tmp_pa
     for closing in ("open_loop", "uncertainty"):
         spec = dataclasses.replace(QUICK, simulator=simulator, closing=closing)
         assert not close_hand(grasp, wild, cylinder(), spec).held
-        result = pull_grasp(GraspTrial(wild, grasp, cylinder()), protocol.with_trial(closing=closing, kp=None))
+        result = pull_grasp(GraspTrial(wild, grasp, Truth(cylinder())), protocol.with_trial(closing=closing, kp=None))
         assert result.status in (Status.UNSTABLE, Status.MOVED)
-    deep = GraspTrial(hand, grasp, cylinder((0.04, 0.04)))
+    deep = GraspTrial(hand, grasp, Truth(cylinder((0.04, 0.04))))
     assert pull_grasp(deep, protocol).status is Status.START_OVERLAP
     thrown = pull_grasp(deep, protocol.with_trial(overlap=1.0))  # no overlap is refused: the object is thrown out
     assert thrown.status in (Status.EJECTED, Status.MOVED) and not thrown.passed

@@ -7,11 +7,11 @@ from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, Pull
 from torchgrasp.evaluation.pull import PullResult, pull_grasp
 from torchgrasp.evaluation.run import evaluate
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore, summarise
-from torchgrasp.evaluation.trial import GraspTrial
+from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.evaluation.views import EvaluationSpec
 
 __all__ = [
     "PROTOCOLS", "ClosingTrace", "Disturbance", "EvaluationSpec", "GraspTrial", "ObjectMotion", "PoseNoise",
-    "Protocol", "ProtocolResult", "PullResult", "PullSpec", "Share", "ViewScore", "close_hand", "evaluate",
-    "find_protocol", "pull_grasp", "summarise",
+    "Protocol", "ProtocolResult", "PullResult", "PullSpec", "Share", "Truth", "ViewScore", "close_hand",
+    "evaluate", "find_protocol", "pull_grasp", "summarise",
 ]  # fmt: skip

@@ -19,7 +19,7 @@ from torchgrasp.cloud.agreement import check_agreement, check_stand
 from torchgrasp.control import TipContact
 from torchgrasp.control.reference import check_single
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, smooth_step
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
@@ -53,6 +53,7 @@ def close_hand(
     parts: "Sequence[trimesh.Trimesh] | None" = None,
     table: Plane | None = None,
     neighbours: Sequence[Neighbour] = (),
+    told: Plane | None = None,
     surface: SignedDistanceField | None = None,
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in simulation.
@@ -69,8 +70,9 @@ def close_hand(
         seed: random seed of the tactile sensors' noise.
         error: true pose of the hand in its planned frame, unknown to the controller; by default the planned pose.
         parts: convex parts of the mesh; by default they are computed (`convex_parts`).
-        table: the table below the object, in the grasp's frame; by default horizontal, at the mesh's lowest point.
+        table: the true table below the object, in the grasp's frame; by default level, at the mesh's lowest point.
         neighbours: other bodies on the table, which the hand may push.
+        told: the table that the controller knows, in the grasp's frame; by default that of the plan (`Grasps.table`).
         surface: estimated surface of the object (`surface_field`), to estimate the object's pose from touches. Without
             it, only the tangent planes of the planned contacts are used.
 
@@ -93,7 +95,8 @@ def close_hand(
     check_agreement("mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99)
     if table is not None:
         check_stand(mesh, table)
-    return lift_grasp(GraspTrial(hand, grasp, mesh, seed, error, parts, table, neighbours, surface), spec)
+    truth = Truth(mesh, parts, error, table, neighbours)
+    return lift_grasp(GraspTrial(hand, grasp, truth, seed, told, surface), spec)
 
 
 @checked
@@ -133,6 +136,30 @@ class _Tick(Value):
     felt: Float[Tensor, "*t 2"]
     blend: Float[Tensor, "*t f"]
     truth: TipContact
+
+
+def judge_lift(ticks: Sequence[_Tick], pressed: int, judged: int, lift_height: float) -> Status:
+    """Return whether an object was held in a lift of some height [m]: `OK`, `SLIPPED`, `DROPPED` or `NOT_LIFTED`.
+
+    It is held if its centre rose by half of the lift, two fingers touch it in most of the last `judged` ticks, and it
+    slipped less than the limits since the tick `pressed`.
+    """
+    half = 0.5 * lift_height
+    rise = [float(tick.centre[2] - ticks[0].centre[2]) for tick in ticks]
+    gripped = [bool(tick.touching >= 2) for tick in ticks[-judged:]]
+    if rise[-1] >= half and sum(gripped) > 0.5 * len(gripped):
+        slip = _motion_between(ticks[pressed], ticks[-1])
+        return Status.OK if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE else Status.SLIPPED
+    return Status.DROPPED if max(rise) >= half else Status.NOT_LIFTED
+
+
+def _motion_between(first: _Tick, last: _Tick, in_hand: bool = True) -> ObjectMotion:
+    """Return the motion of the object's centre and its rotation between two ticks, relative to the hand or world."""
+    eye = torch.eye(4, dtype=torch.float64)
+    start, end = (inverse(tick.hand_pose) if in_hand else eye for tick in (first, last))
+    centres = apply(torch.stack([start, end]), torch.stack([first.centre, last.centre])[:, None])[:, 0]
+    turned = (start @ first.object_pose)[:3, :3].T @ (end @ last.object_pose)[:3, :3]
+    return ObjectMotion(float(torch.linalg.vector_norm(centres[1] - centres[0])), float(rotation_angle(turned)))
 
 
 class _Lift:
@@ -224,30 +251,21 @@ class _Lift:
 
     def _verdict(self) -> Status:
         """Return the status of a completed trial: `Status.OK` if the object was held, or else the first failure."""
-        judged_time = 0.2  # time [s] at the end of a trial in which contacts are counted
-        half = 0.5 * self.spec.lift_height
-        rise = [float(tick.centre[2] - self.ticks[0].centre[2]) for tick in self.ticks]
-        gripped = [bool(tick.touching >= 2) for tick in self.ticks[-self.run.robot.ticks(judged_time) :]]
-        if rise[-1] >= half and sum(gripped) > 0.5 * len(gripped):
-            slip = self._motion(self.pressed, -1)
-            return Status.OK if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE else Status.SLIPPED
+        last = self.run.robot.ticks(0.2)  # the time [s] at the end of a trial in which contacts are counted
+        judged = judge_lift(self.ticks, self.pressed or 0, last, self.spec.lift_height)
+        if judged in (Status.OK, Status.SLIPPED):
+            return judged
         if not np.isfinite(self.run.robot.first_touch).all():
             return Status.NO_CONTACT
         if self.pushed > PUSHED_DISTANCE:
             return Status.EJECTED
-        if self.strained:
-            return Status.TOO_WEAK
-        return Status.DROPPED if max(rise) >= half else Status.NOT_LIFTED
+        return Status.TOO_WEAK if self.strained else judged
 
     def _motion(self, first: int | None, last: int | None, in_hand: bool = True) -> ObjectMotion:
         """Return the object's motion between two ticks, relative to the hand or the world; NaN if a tick is None."""
         if first is None or last is None:
             return ObjectMotion(math.nan, math.nan)
-        ticks = self.ticks[first], self.ticks[last]
-        start, end = (inverse(x.hand_pose) @ x.object_pose if in_hand else x.object_pose for x in ticks)
-        centres = apply(torch.stack([start, end]), torch.from_numpy(self.run.scene.centre).expand(2, 1, 3))[:, 0]
-        distance = float(torch.linalg.vector_norm(centres[1] - centres[0]))
-        return ObjectMotion(distance, float(rotation_angle(start[:3, :3].T @ end[:3, :3])))
+        return _motion_between(self.ticks[first], self.ticks[last], in_hand)
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record of the trial as a `ClosureResult`."""

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Pose, Seed, checked
+from torchgrasp.closure import SensorModel
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding import GripHold
 from torchgrasp.control.paper.stability import load_stability
@@ -27,7 +28,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
-from torchgrasp.specs import TrialSpec
+from torchgrasp.specs import ClosingMode, TrialSpec
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -38,17 +39,26 @@ if TYPE_CHECKING:
 
 @checked
 @dataclasses.dataclass(frozen=True)
+class Truth:
+    """The true world of a trial, which only the simulator gets; the fields are arguments of `close_hand`."""
+
+    mesh: "trimesh.Trimesh | Path | str"
+    parts: "Sequence[trimesh.Trimesh] | None" = None
+    error: Pose | None = None
+    table: Plane | None = None
+    neighbours: Sequence[Neighbour] = ()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """The input of a trial: a grasp and the true object; the fields are the arguments of `close_hand`."""
+    """The input of a trial: the truth, and what the robot knows; the fields are arguments of `close_hand`."""
 
     hand: Hand
     grasp: Grasps
-    mesh: "trimesh.Trimesh | Path | str"
+    truth: Truth
     seed: Seed = 0
-    error: Pose | None = None
-    parts: "Sequence[trimesh.Trimesh] | None" = None
-    table: Plane | None = None
-    neighbours: Sequence[Neighbour] = ()
+    told: Plane | None = None
     surface: SignedDistanceField | None = None
 
 
@@ -56,9 +66,9 @@ class TrialDriver:
     """A trial that is checked once and can run any number of times.
 
     Attributes:
-        reference: the closing plan; by default derived from the trial's hand and grasp.
-        obj_from_world: pose of the simulator's frame in the grasp's frame. If there is a table, the frame is upright
-            on it. Poses in the simulator's frame are rounded, so that results are bitwise invariant to rigid motion.
+        reference: the closing plan; by default derived from what the robot knows of the trial.
+        obj_from_world: pose of the simulator's frame in the grasp's frame. If there is a true table, the frame is
+            upright on it. Numbers are then rounded, so that results are bitwise invariant to rigid motion.
 
     Raises:
         BadArgument, MeshError: as in `close_hand`.
@@ -68,37 +78,41 @@ class TrialDriver:
         check_single(trial.grasp)
         self.trial, self.spec = trial, spec
         hand, planned = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
-        self.obj_from_world, grasp = torch.eye(4, dtype=torch.float64), planned
-        if trial.table is not None:
-            self.obj_from_world = world_frame(trial.table, planned.obj_from_hand[0])
-            grasp = _to_world(planned, self.obj_from_world)
-        body = self._body(trial.mesh, trial.parts)
+        self.obj_from_world, grasp, known = torch.eye(4, dtype=torch.float64), planned, planned
+        told, pose = trial.grasp.table if trial.told is None else trial.told, planned.obj_from_hand[0]
+        if trial.truth.table is not None:
+            self.obj_from_world = world_frame(trial.truth.table, pose)
+            grasp, known = _to_frame(planned, self.obj_from_world), _to_frame(planned, pose)
+            if told is not None:
+                told = told.moved(inverse(pose))
+                told = Plane(_rounded(told.normal), round(told.offset, 9))
         if reference is None:
-            height = float(body.mesh.bounds[0, 2]) if trial.table is None else 0.0
-            table = Plane.horizontal(height).moved(inverse(grasp.obj_from_hand[0])) if spec.table else None
-            known = {"table": table, "surface": trial.surface, "sensor": spec.sensor, "max_force": spec.max_force}
-            derived = derive_reference(hand, grasp, spec)
-            reference = dataclasses.replace(derived, obj_from_hand=planned.obj_from_hand[0], **known)
+            reference = derive_reference(
+                hand, known, told if spec.table else None, trial.surface, spec.closing, spec.force, spec.kp,
+                spec.sensor, spec.max_force,
+            )  # fmt: skip
+            reference = dataclasses.replace(reference, obj_from_hand=pose)
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
             raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
         self.reference = reference
-        self.scene_spec = self._scene_spec(hand, grasp, body)
+        self.scene_spec = self._scene_spec(hand, grasp)
 
-    def _scene_spec(self, hand: Hand, grasp: Grasps, body: Body) -> SceneSpec:
+    def _scene_spec(self, hand: Hand, grasp: Grasps) -> SceneSpec:
         """Return the parameters of the simulated scene; the hand's true pose in it includes the trial's pose error."""
-        spec, trial, drives = self.spec, self.trial, hand.actuators
+        spec, truth, drives = self.spec, self.trial.truth, hand.actuators
+        body = self._body(truth.mesh, truth.parts)
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
-        true_pose = apply_error(grasp.obj_from_hand[0], trial.error)
+        true_pose = apply_error(grasp.obj_from_hand[0], truth.error)
         approach = true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
         return SceneSpec(
             urdf_path=hand.urdf_path, world_from_hand=true_pose.numpy(), joints=_by_name(hand, grasp.pregrasp[0]),
             drives=drives, tip_links=tuple(hand.tips.links), mesh=body.mesh, parts=list(body.parts), mass=body.mass,
             friction=spec.friction, gravity=spec.gravity, timestep=spec.timestep, travel=spec.lift_height,
             approach=tuple(approach.tolist()), table=spec.table, patch=spec.patch,
-            height=None if trial.table is None else 0.0,
-            neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in trial.neighbours),
+            height=None if truth.table is None else 0.0,
+            neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in truth.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (), yields=spec.components.palm_reach,
         )  # fmt: skip
 
@@ -107,7 +121,7 @@ class TrialDriver:
         mesh, parts = read_solid(given, parts)
         if mass is None:
             mass = self.spec.mass if self.spec.density is None else self.spec.density * float(mesh.volume)
-        if self.trial.table is not None:
+        if self.trial.truth.table is not None:
             mesh, *parts = (_moved(x, self.obj_from_world) for x in (mesh, *parts))
         return Body(mesh, parts, mass)
 
@@ -123,13 +137,19 @@ class TrialDriver:
         return open_scene(scene_spec, self.spec.simulator).penetration()
 
 
-def derive_reference(hand: Hand, grasp: Grasps, spec: TrialSpec) -> ClosingReference:
-    """Return the closing plan of a trial; for closing "paper" the hand's stability model, if any, gives the forces."""
+def derive_reference(
+    hand: Hand, grasp: Grasps, table: Plane | None = None, surface: SignedDistanceField | None = None,
+    closing: ClosingMode = "uncertainty", force: float = 4.0, kp: float | None = None,
+    sensor: SensorModel | None = None, max_force: float | None = None,
+) -> ClosingReference:  # fmt: skip
+    """Return the closing plan, given all that the robot knows; its table is in the frame of the grasp."""
     stability = None
-    if spec.closing == "paper":
+    if closing == "paper":
         hand.require_three("closing", "'paper', whose model of stability is of three,")
         stability = load_stability(hand)
-    return ClosingReference.from_grasp(hand, grasp, spec.force, spec.kp, stability)
+    plan = ClosingReference.from_grasp(hand, grasp, force, kp, stability)
+    table, sensor = table and table.moved(inverse(grasp.obj_from_hand[0])), sensor or plan.sensor
+    return dataclasses.replace(plan, table=table, surface=surface, sensor=sensor, max_force=max_force)
 
 
 class TrialRun:
@@ -216,17 +236,17 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
     return rigid(torch.stack([x, torch.linalg.cross(z, x), z], -1), origin - table.height(origin) * z)
 
 
-def _to_world(grasp: Grasps, obj_from_world: Float[Tensor, "4 4"]) -> Grasps:
-    """Return a grasp, converted to the simulator's frame, with rounded numbers."""
-    world_from_obj = inverse(obj_from_world)
+def _to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
+    """Return a grasp, converted to another frame, with rounded numbers."""
+    frame_from_obj = inverse(obj_from_frame)
 
     def turn(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        return _rounded(vectors @ world_from_obj[:3, :3].T)
+        return _rounded(vectors @ frame_from_obj[:3, :3].T)
 
     contacts = dataclasses.replace(
-        grasp.contacts, points=to_upright(grasp.contacts.points, obj_from_world), normals=turn(grasp.contacts.normals)
+        grasp.contacts, points=to_upright(grasp.contacts.points, obj_from_frame), normals=turn(grasp.contacts.normals)
     )
-    pose = _rounded(world_from_obj @ grasp.obj_from_hand)
+    pose = _rounded(frame_from_obj @ grasp.obj_from_hand)
     return dataclasses.replace(grasp, contacts=contacts, obj_from_hand=pose, approach=turn(grasp.approach))
 
 

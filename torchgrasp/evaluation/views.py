@@ -14,7 +14,7 @@ from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError
 from torchgrasp.evaluation.protocols import Protocol, draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
-from torchgrasp.evaluation.trial import GraspTrial
+from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand, HandSource
@@ -170,7 +170,7 @@ def try_grasp(
     error, surface = draw_error(protocol, grasp, mesh, seed), None
     if trial.table and (trial.components.stops or trial.components.attempts > 1):
         surface = _fit_surface(view.objects, view.object, view.view)
-    attempt = GraspTrial(hand, grasp, mesh, seed_of(seed, "touch"), error, parts=parts, surface=surface)
+    attempt = GraspTrial(hand, grasp, Truth(mesh, parts, error), seed_of(seed, "touch"), surface=surface)
     return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))
 
 

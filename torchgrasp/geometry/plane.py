@@ -78,6 +78,16 @@ class Plane(Value):
         return f"normal {x:.9g} {y:.9g} {z:.9g}, offset {self.offset:.9g}"
 
 
+def read_plane(text: str) -> Plane:
+    """Return the plane that `Plane.describe` wrote as a text; raise `BadArgument` for another text."""
+    words = text.replace(",", "").split()
+    try:
+        x, y, z, offset = (float(words[k]) for k in (1, 2, 3, 5))
+    except (ValueError, IndexError):
+        raise BadArgument("table", repr(text), "'normal X Y Z, offset D'") from None
+    return Plane(torch.tensor([x, y, z], dtype=torch.float64), offset)
+
+
 def as_plane(table: Plane | float | None) -> Plane | None:
     """Return a table as a plane. It is given as a plane or as its height [m] along z; None means no table."""
     if table is None or isinstance(table, Plane):

@@ -38,7 +38,7 @@ from benchmarks.perturb import PERTURBATIONS, perturb_trial
 from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand
 from torchgrasp.closure import SensorModel
 from torchgrasp.errors import GraspError
-from torchgrasp.evaluation import PROTOCOLS, GraspTrial, pull_grasp
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, Truth, pull_grasp
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import error_from_object_pose, seed_of
@@ -216,7 +216,7 @@ def _try(spec: TableSpec, subject: Subject, hand: str, condition: str, law: str)
         error, touch = _misplace(wrong, grasps[rank], mesh, seed), seed_of(seed, "touch")
         grasp = swap_deviations(grasps[rank]) if followed.swapped else grasps[rank]
         surface = fit_view(spec, subject)[1]
-        trial = GraspTrial(load_hand(hand), grasp, mesh, touch, error, parts=parts, surface=surface)
+        trial = GraspTrial(load_hand(hand), grasp, Truth(mesh, parts, error), touch, surface=surface)
         measured = _run(trial, wrong, followed, read_solid(subject).mass, seed)
         known = subject.label, subject.family, hand, rank, condition, law
         yield Outcome(*known, seconds=time.process_time() - began, **measured)
@@ -245,7 +245,7 @@ def _run(trial: GraspTrial, wrong: Condition, law: Law, mass: float, seed: int) 
         "moved": 1e3 * done.before_lift.distance,
         "unbalanced": done.unbalanced,
         "most": float(done.forces.max()),
-        "early": _moved_early(done, trial.mesh),
+        "early": _moved_early(done, trial.truth.mesh),
     }
     return {"status": done.status.name} | {name: None if math.isnan(x) else x for name, x in measured.items()}
 

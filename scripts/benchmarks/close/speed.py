@@ -13,7 +13,7 @@ from torchgrasp import TrialSpec, close_hand, fit_shape, load_hand, load_object
 from torchgrasp.control import GraspController
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import Status
-from torchgrasp.evaluation import GraspTrial
+from torchgrasp.evaluation import GraspTrial, Truth
 from torchgrasp.evaluation.trial import TrialDriver
 from torchgrasp.jobs import run_tasks
 from torchgrasp.shape.surface import surface_field
@@ -57,7 +57,7 @@ def time_steps(name: str, steps: int) -> Row:
     """
     jug = load_object("jug")
     surface = surface_field(fit_shape(jug.view, table=0.0))  # so that some ticks search for the object
-    trial = GraspTrial(load_hand(name), load_shipped_grasp("jug", name), jug.mesh, parts=jug.parts, surface=surface)
+    trial = GraspTrial(load_hand(name), load_shipped_grasp("jug", name), Truth(jug.mesh, jug.parts), surface=surface)
     driver = TrialDriver(trial, TrialSpec(approach=0.0, holding="grip"))
     run = driver.open()
     ticks = [run.observation for _ in run.close()]

@@ -18,7 +18,7 @@ from torchgrasp.errors import Status
 from torchgrasp.evaluation import score
 from torchgrasp.evaluation.protocols import PROTOCOLS, draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
-from torchgrasp.evaluation.trial import GraspTrial
+from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.load import load_hand
@@ -160,7 +160,7 @@ def try_object(source: Path, name: str, hand: str, grasps: int, folder: Path) ->
             protocol = PROTOCOLS[TESTS[test][0]].with_trial(closing=TESTS[test][1])
             seed, grasp = seed_of(0, name, hand, rank, test), executable[rank]
             error = draw_error(protocol, grasp, mesh, seed)
-            trial = GraspTrial(model, grasp, mesh, seed_of(seed, "touch"), error, parts=parts)
+            trial = GraspTrial(model, grasp, Truth(mesh, parts, error), seed_of(seed, "touch"))
             passed = run_protocol(trial, protocol, rank).passed
             rows.append({"object": name, "view": view, "hand": hand, "test": test, "rank": rank, "passed": passed})
     write_file(kept_at(source, name, hand, grasps, folder), format_json(rows))

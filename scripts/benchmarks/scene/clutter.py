@@ -17,7 +17,7 @@ from benchmarks.common import Options, Row, bench
 from benchmarks.scene.drop import PlacedScene, aim, drop, settle
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation import GraspTrial, Share
+from torchgrasp.evaluation import GraspTrial, Share, Truth
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.geometry.plane import Plane
@@ -180,8 +180,8 @@ def run_scene_trial(placed: PlacedScene, label: int, grasp: Grasps, hand: Hand, 
     k = label - 1
     others = [i for i in range(len(placed)) if i != k]
     around = [Neighbour(placed.meshes[i], placed.parts[i]) for i in others]
-    table = Plane.horizontal(0.0)
-    trial = GraspTrial(hand, grasp, placed.meshes[k], seed, parts=placed.parts[k], table=table, neighbours=around)
+    truth = Truth(placed.meshes[k], placed.parts[k], table=Plane.horizontal(0.0), neighbours=around)
+    trial = GraspTrial(hand, grasp, truth, seed)
     closure = lift_grasp(trial, spec)
     motion = torch.zeros(len(placed), 4, 4, dtype=torch.float64)
     motion[others], motion[k] = closure.disturbance.neighbour_pose[-1], closure.object_pose[-1]

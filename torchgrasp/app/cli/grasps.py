@@ -126,12 +126,14 @@ class Grasp(Command):
         view = self.view.with_table_of(file)
         cloud, table = file.cloud, view.plane(file.cloud)
         spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(friction=self.friction, table=table)
-        true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
+        true_mesh, parts, plane = (None, None, None) if mesh is None else (*read_true_mesh(mesh), None)
         print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
             check_mesh(cloud, true_mesh, "--mesh")
-            plane = None if view.table is None else as_plane(table)
-            if plane is not None:
+            plane = as_plane(table)
+            if plane is not None and view.table is None:  # the robot guesses its height, which the true mesh tells
+                plane = dataclasses.replace(plane, offset=float((true_mesh.vertices @ plane.normal.numpy()).min()))
+            elif plane is not None:
                 check_stand(true_mesh, plane, "--mesh")
         progress = Progress(*["fingers"] * (among is not None), *STAGES, *["closing"] * self.close, "report")
         with progress.bar, holding("--out", out):
@@ -150,7 +152,8 @@ class Grasp(Command):
             run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, explanation=explanation)
             if self.close and true_mesh is not None and len(run.executable):
                 felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
-                trial, options = TrialSpec(friction=self.friction), {"parts": parts, "surface": felt}
+                trial = TrialSpec(friction=self.friction)
+                options = {"parts": parts, "table": plane, "surface": felt}
                 closure = close_hand(run.executable[0], hand, true_mesh, trial, seed=self.seed, **options)
                 progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
                 run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
