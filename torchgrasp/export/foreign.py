@@ -175,7 +175,7 @@ def grasps_from_joints(
 
     Contacts are at the middle of each pad, with normals opposite to the pads'. Certificates are for these contacts; a
     grasp without force closure gets `Status.NOT_CLOSED`. Replace contacts and certificate if you know the surface.
-    `clearance` is that of self-collision, because no object is known. `score` is 0, because nothing is predicted. The
+    `clearance` is that of self-collision, and success is unknown, because no object is known. The
     approach is the hand's own approach axis.
 
     Args:
@@ -212,6 +212,7 @@ def grasps_from_joints(
         permutation=torch.arange(f).expand(g, f).clone(), tip_error=zeros, clearance=hand.self_clearance(joints),
         normal_angle=zeros, certificate=certificate, score=torch.zeros(g, dtype=torch.float64),
         status=torch.where(certificate.closed, int(Status.OK), int(Status.NOT_CLOSED)), meta=meta,
+        known=torch.zeros(g, dtype=torch.bool),
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_rpy
 from torchgrasp.hand.hand_toml import Pad
-from torchgrasp.hand.kinematics import map_directions, map_points, pose_in_carrier
+from torchgrasp.hand.kinematics import chain_from_urdf, map_directions, map_points, pose_in_carrier
 from torchgrasp.hand.urdf import Joint, Link, Shape, Triple, Urdf
 
 TILT = math.radians(30)
@@ -139,7 +139,7 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
 def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
     """Return a point near the far end of a tip, in its frame: half its thickness before the end of a simple shape."""
     if not is_primitive(link):
-        points, pose = surfaces[link.name], pose_in_carrier(urdf, link.name)[1].numpy()
+        points, pose = surfaces[link.name], pose_in_carrier(chain_from_urdf(urdf), link.name)[1].numpy()
         reach = np.linalg.norm(points @ pose[:, :3].T + pose[:, 3], axis=1)
         return points[reach > reach.max() - BESIDE].mean(0)
     shape = link.shapes[0]
