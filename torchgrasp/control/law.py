@@ -37,10 +37,10 @@ def printed_covariance(
     """Return the covariance [m^2] that Eq. (27) of the paper prints: Sigma_cov = diag(|R f_cov n|).
 
     `distance_variance` [m^2] is f_cov, the variance of the signed distance. `normals` are R n, in the hand's frame. A
-    normal across an axis makes Sigma_cov singular, so an entry is at least 1 mm^2.
+    normal across an axis makes Sigma_cov singular, so each entry is at least the square of `floor`, 0.1 mm.
     """
-    entries = (distance_variance[..., None] * normals).abs()
-    return torch.diag_embed(entries.clamp_min(1e-6))
+    floor = 1e-4  # [m]
+    return torch.diag_embed((distance_variance[..., None] * normals).abs().clamp_min(floor**2))
 
 
 def force_covariance(
@@ -70,11 +70,9 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
     return torch.exp(-0.5 * squared_mahalanobis(error, factor))
 
 
-def position_gain(
-    covariance: Float[Tensor, "*b 3 3"], alpha_p: float = POSITION_RATE * POSITION_FLOOR**2
-) -> Float[Tensor, "*b 3"]:
-    """Return the position gain [1/s] on each axis: alpha_p [m^2/s] over the axis's variance, Eq. (27) of the paper."""
-    return alpha_p / covariance.diagonal(dim1=-2, dim2=-1)
+def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Return the position gain [1/s] on each axis: a constant over the axis's variance, Eq. (27) of the paper."""
+    return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
 
 def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float) -> Float[Tensor, "*b 3"]:

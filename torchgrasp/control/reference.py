@@ -140,10 +140,8 @@ class ClosingReference(Value):
         if self.distance_variance is None:
             found = "'paper' without f_cov, the variance of the signed distance [m^2]"
             raise BadArgument("closing", found, "grasps of `plan_grasps`, whose metadata hold unit_m")
-        covariance, alpha_p = law.printed_covariance(self.normals, self.distance_variance), 4e-5  # [m^2/s]
-        gains = dataclasses.replace(
-            self.gains, covariance=covariance, position_gain=law.position_gain(covariance, alpha_p)
-        )
+        covariance = law.printed_covariance(self.normals, self.distance_variance)
+        gains = dataclasses.replace(self.gains, covariance=covariance, position_gain=law.position_gain(covariance))
         return dataclasses.replace(self, gains=gains)
 
     @checked

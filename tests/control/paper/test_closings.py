@@ -25,12 +25,12 @@ HANDS = ("allegro", "barrett")
 def printed_law(normal, f_cov, dev, compliance, goal, tips, force, reading, jacobian, posture, period):
     """Eqs. (25)-(28) for the fingers of a hand, with the changes that docs/paper.md declares.
 
-    These are: at least 1 mm^2 in Sigma_cov, 0.3 N in Sigma_fd, the values of alpha, a speed limit for all fingers, and
+    These are: at least 0.01 mm^2 in Sigma_cov, 0.3 N in Sigma_fd, the values of alpha, a speed limit for all fingers, and
     damped least squares in place of J^-1, whose null space follows the posture.
     """
-    sigma_cov = np.maximum(np.abs(f_cov[:, None] * normal), 1e-6)  # the diagonals of Eq. (27)
+    sigma_cov = np.maximum(np.abs(f_cov[:, None] * normal), 1e-8)  # the diagonals of Eq. (27)
     sigma_fd = dev[:, None] ** 2 * normal**2 + 0.3**2
-    k_p = 4e-5 / sigma_cov
+    k_p = 1e-4 / sigma_cov
     c_f = (15.0 * compliance * min(dev**2 + 0.3**2))[:, None] / sigma_fd
     error = goal - tips
     share = np.exp(-0.5 * (error**2 / sigma_cov).sum(1))
@@ -74,7 +74,7 @@ def drawn_plan(name: str, seed: int):
 @pytest.mark.parametrize("name", HANDS)
 def test_eqs_25_to_28_of_the_paper_in_numpy(name):
     floored = 0
-    for seed in range(12):
+    for seed in range(8):
         hand, grasp, model, plan, seen = drawn_plan(name, seed)
         pose = grasp.obj_from_hand[0].double().numpy()
         normal = grasp.contacts.normals[0].double().numpy() @ pose[:3, :3]  # R f_w, in the hand's frame
@@ -96,9 +96,9 @@ def test_eqs_25_to_28_of_the_paper_in_numpy(name):
         found = law.reference.gains.position_gain, law.reference.gains.force_gain, law.share, step
         for ours, theirs in zip(found, oracle, strict=True):
             np.testing.assert_allclose(ours.numpy(), theirs, rtol=1e-12, atol=1e-14)
-        assert np.allclose(law.reference.gains.covariance.numpy(), [np.diag(4e-5 / k) for k in oracle[0]], rtol=1e-12)
-        floored += int((oracle[0] > 39.9999).sum())
-    assert 0 < floored < 12 * 9 / 2  # most entries are as printed
+        assert np.allclose(law.reference.gains.covariance.numpy(), [np.diag(1e-4 / k) for k in oracle[0]], rtol=1e-12)
+        floored += int((oracle[0] > 9999.9).sum())
+    assert floored < 5  # nearly all entries are as printed
 
 
 def test_the_papers_law_needs_the_variance_of_the_signed_distance():
