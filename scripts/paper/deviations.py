@@ -101,9 +101,7 @@ def as_written(x: Tensor, psi: float) -> Tensor:
     block = torch.zeros(len(r), 4, 4).to(x)
     block[:, 0, 0] = k
     block[:, 1:, 0] = block[:, 0, 1:] = first[:, None] * d
-    block[:, 1:, 1:] = (
-        first[:, None, None] * torch.eye(3).to(x) + second[:, None, None] * d[:, :, None] * d[:, None, :]
-    )
+    block[:, 1:, 1:] = first[:, None, None] * torch.eye(3).to(x) + second[:, None, None] * d[:, :, None] * d[:, None, :]
     return block.unflatten(0, (len(x), len(x))).permute(0, 2, 1, 3).reshape(4 * len(x), -1)
 
 
@@ -148,14 +146,19 @@ def of_shapes(views: int) -> Iterator[tuple[str, str]]:
         x = shape.normalise(shape.cloud.points.double())
         lengths.append(torch.linalg.vector_norm(shape.mean_and_gradient(x)[1], dim=-1))
         away = torch.nn.functional.normalize(x[::10], dim=-1) * shape.domain_radius
-        negative = [n + int((shape.estimate(f * away)[1][:, 0, 0] < 0).sum()) for n, f in zip(negative, (2, 4), strict=True)]
+        negative = [
+            n + int((shape.estimate(f * away)[1][:, 0, 0] < 0).sum()) for n, f in zip(negative, (2, 4), strict=True)
+        ]
         far += len(away)
         box = (cloud.points.amax(0) + cloud.points.amin(0)) / 2, (cloud.points.amax(0) - cloud.points.amin(0)) / 2
         corners.append(float(torch.linalg.vector_norm((cloud.points - box[0]) / box[1], dim=-1).max()))
     steep = torch.cat(lengths)
     low, high = (float(steep.quantile(q)) for q in (0.05, 0.95))
     of_all = f"of {len(clouds)} clouds"
-    yield "Eq. (6), psi the longest distance, a normal for each point: K + sigma^2 I indefinite", f"{indefinite} {of_all}"
+    yield (
+        "Eq. (6), psi the longest distance, a normal for each point: K + sigma^2 I indefinite",
+        f"{indefinite} {of_all}",
+    )
     yield "the same with normals on the surface alone", f"{ours} {of_all}; `psi_scale=1` raises for {refused}"
     ends = f"{float(steep.min()):.2f} to {float(steep.max()):.1f}, 90 % within {low:.2f} to {high:.1f}"
     yield "Eq. (11), lengths of f_w at the cloud's points", ends
