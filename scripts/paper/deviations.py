@@ -156,7 +156,7 @@ def of_shapes(views: int) -> Iterator[tuple[str, str]]:
     low, high = (float(steep.quantile(q)) for q in (0.05, 0.95))
     of_all = f"of {len(clouds)} clouds"
     yield (
-        "Eq. (6), psi the longest distance, a normal for each point: K + sigma^2 I indefinite",
+        "Eq. (6), psi the longest distance, a normal at each point: K + sigma^2 I indefinite",
         f"{indefinite} {of_all}",
     )
     yield "the same with normals on the surface alone", f"{ours} {of_all}; `psi_scale=1` raises for {refused}"

@@ -25,7 +25,7 @@ HANDS = ("allegro", "barrett")
 def printed_law(normal, f_cov, dev, compliance, goal, tips, force, reading, jacobian, posture, period):
     """Eqs. (25)-(28) for the fingers of a hand, with the changes that docs/paper.md declares.
 
-    These are: at least 0.01 mm^2 in Sigma_cov, 0.3 N in Sigma_fd, the values of alpha, a speed limit for all fingers, and
+    These are: at least 0.01 mm^2 in Sigma_cov, 0.3 N in Sigma_fd, values of alpha, a speed limit for all fingers, and
     damped least squares in place of J^-1, whose null space follows the posture.
     """
     sigma_cov = np.maximum(np.abs(f_cov[:, None] * normal), 1e-8)  # the diagonals of Eq. (27)
