@@ -209,6 +209,27 @@ def test_a_start_in_the_object_missing_contact_and_too_little_friction_are_named
     assert slippery.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED) and not slippery.held
 
 
+@pytest.mark.parametrize(("friction", "simulator"), [(0.4, "sapien"), (0.8, "sapien"), (0.4, "mujoco")])
+@pytest.mark.parametrize(("share", "held"), [(0.85, True), (1.25, False)])
+def test_the_fingers_carry_the_weight_that_friction_allows(simulator, friction, share, held):
+    """Fingers that press horizontally with N in all carry at most friction x N, so at most friction x N / g [kg]."""
+    pytest.importorskip(simulator)
+    gains = derive_reference(*pinch("allegro")).gains
+    most = friction * float(gains.desired_force.norm(dim=-1).sum()) / 9.81
+    spec = dataclasses.replace(STILL, approach=0.0, friction=friction, mass=share * most, simulator=simulator)
+    found = close("allegro", spec=spec)
+    assert found.held is held and (held or found.status in (Status.NOT_LIFTED, Status.DROPPED))
+
+
+def test_mass_density_and_friction_reach_the_simulators_parameters():
+    hand, grasp = pinch("allegro")
+    for changes in ({"mass": 0.1}, {"mass": 0.7, "friction": 0.3}, {"density": 300.0, "gravity": 2.0}):
+        spec, mesh = TrialSpec(**changes), cylinder()
+        found = TrialDriver(GraspTrial(hand, grasp, Truth(mesh, [mesh])), spec).scene_spec
+        mass = spec.mass if spec.density is None else 300.0 * mesh.volume
+        assert (found.mass, found.friction, found.gravity) == (mass, spec.friction, spec.gravity)
+
+
 def test_a_mesh_and_a_table_that_contradict_the_grasp_are_told_before_any_work(monkeypatch):
     hand, grasp = pinch("barrett")
 
