@@ -46,22 +46,18 @@ def leap_tip() -> Finding:
     return found, found == "index_tip 10.5 mm"
 
 
-@claim(
-    HANDS, "57.9% of 5000 random postures", "default on the shipped cylinder: 100 of 100", "shipped cylinder: 69 of 100"
-)
+@claim(HANDS, "57.9% of 5000 random postures", "cylinder: 100 of 100 grasps", "cylinder: 66 of 99 grasps")
 def leap_check() -> Finding:
     """Check the drafted hand; other processors round differently, so counts may differ by three."""
     said = call("hand", "check", "mine", "--out", "mine/hand.png")
     share = float(found_in(said, r"([\d.]+)% of 5000 random postures collide"))
-    three, four = (
-        int(found_in(said, rf"{name} on the shipped cylinder: (\d+) of 100")) for name in ("default", "four")
-    )
-    held = abs(share - 57.9) < 0.5 and abs(three - 100) <= 3 and abs(four - 69) <= 3 and "the hand can grasp" in said
-    return f"{share} %, {three} and {four} of 100", held
+    counts = [int(x) for x in re.findall(r"cylinder: (\d+) of \d+ grasps", said)]
+    held = len(counts) == 2 and abs(counts[0] - 100) <= 3 and abs(counts[1] - 66) <= 3
+    return f"{share} %; {counts} grasps executable", held and abs(share - 57.9) < 0.5
 
 
 @claim(
-    HANDS, "held the cylinder: lifted 0.10 m, moved 2 mm and 1 deg in the hand", "to a held object in about ten minutes"
+    HANDS, "held the cylinder: lifted 0.10 m, moved 3 mm and 2 deg in the hand", "to a held object in about ten minutes"
 )
 def leap_holds() -> Finding:
     """Correct the draft as the guide does, plan, and close in the simulator; 1 mm or 1 degree more is as good."""
@@ -74,7 +70,7 @@ def leap_holds() -> Finding:
     last = call("grasp", cylinder / "view.ply", *words).strip().splitlines()[-1]
     match = re.search(r"held the cylinder: lifted 0.10 m, moved (\d+) mm and (\d+) deg", last)
     took = time.perf_counter() - began
-    return f"{last} ({took:.0f} s)", match is not None and int(match[1]) <= 3 and int(match[2]) <= 2 and took < 300
+    return f"{last} ({took:.0f} s)", match is not None and int(match[1]) <= 4 and int(match[2]) <= 3 and took < 300
 
 
 @claim("docs/fingers.md", "index,middle,ring,thumb 16")
