@@ -84,7 +84,7 @@ def _check_derivatives(kernel: Kernel, r: Float[Tensor, " n"], length: float) ->
     """
     k = float(kernel.profile(torch.zeros(1, dtype=torch.float64)))
     factors = (torch.ones_like(r) / k, length**2 / k, r**2 * (length**2 / k), r**3 * (length**3 / k))
-    given, exact = kernel.derivatives(r, 4), differentiate(kernel.profile, r, 4)
+    given, exact = kernel.derivatives(r, 4), differentiate(kernel.profile, r * r / 2, 4)
     for order, (a, b, factor) in enumerate(zip(given, exact, factors, strict=True)):
         error = ((a - b) * factor).abs().where((r > NEAR_ZERO) | (order < 3), 0.0)
         if not float(error.max()) < 1e-6:
@@ -93,7 +93,7 @@ def _check_derivatives(kernel: Kernel, r: Float[Tensor, " n"], length: float) ->
             raise BrokenLaw("derivatives", found, "that of the profile")
     middle, step = r[10:-1], 1e-5 * length
     slope = (kernel.profile(middle + step) - kernel.profile(middle - step)) / (2 * step)
-    error = (slope - middle * differentiate(kernel.profile, middle, 2)[1]).abs() * (length / k)
+    error = (slope - middle * differentiate(kernel.profile, middle * middle / 2, 2)[1]).abs() * (length / k)
     if not float(error.max()) < 1e-6:
         found = f"k' off by {float(error.max()):.3g} k(0) / length at r = {float(middle[error.argmax()]):.3g}"
         raise BrokenLaw("derivatives", found, "that of finite differences")

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, map_tensors
 from torchgrasp.geometry.linalg import cholesky
 from torchgrasp.shape.kernel import Kernel, covariance_rows, cross_covariance, gram
 from torchgrasp.shape.posterior import Posterior
@@ -25,8 +25,7 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
     """Return the posterior given observations, by one Cholesky factorisation of their covariance."""
     observations = observations.with_normals_first()
     y, noise = observations.rows()
-    matrix = gram(kernel, observations.x, int(observations.has_normal.sum()))
-    matrix.diagonal().add_(noise)
+    matrix = gram(kernel, observations.x, int(observations.has_normal.sum())) + torch.diag_embed(noise)
     factor = cholesky(matrix, "the covariance K + sigma^2 I", kernel.remedy)
     weights = torch.cholesky_solve(y[:, None], factor)[:, 0]
     return Posterior(observations.x, observations.has_normal, weights, factor, None, kernel)
@@ -35,6 +34,7 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
     """Raise `IndefiniteCovariance` if observations are farther apart than the kernel allows and K is indefinite."""
     kernel = posterior.kernel
+    posterior = map_tensors(torch.detach, posterior)
     if longest_distance(posterior.x) > kernel.diameter:
         matrix = gram(kernel, posterior.x, posterior.n_oriented)
         matrix.diagonal().add_(least_noise**2)  # greater noise of some observations can hide an indefinite K
@@ -43,6 +43,7 @@ def check_kernel(posterior: Posterior, least_noise: float) -> None:
 
 def longest_distance(x: Float[Tensor, "n 3"]) -> float:
     """Return the longest distance between any two points."""
+    x = x.detach()
     return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
 
 
@@ -167,7 +168,6 @@ def _extend(
     ]
     order = torch.cat([posterior.ordered(row[0]), row[1] if new_order is None else row[1][new_order]])
     solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
-    weights = torch.empty_like(solved)
-    weights[order] = solved
+    weights = solved[torch.argsort(order)]
     x = torch.cat([posterior.x, new.x])[points]
     return Posterior(x, has[points], weights, factor, order, posterior.kernel)

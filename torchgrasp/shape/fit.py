@@ -10,13 +10,13 @@ from typing import Annotated, Literal
 import torch
 
 from torchgrasp.base import join
-from torchgrasp.checks import LEAST, Positive, Range, Seed, checked
+from torchgrasp.checks import LEAST, Positive, Range, Seed, checked, is_known
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
-from torchgrasp.errors import CutOff, FewPoints, Flat, Gap, TwoBodies
+from torchgrasp.errors import BadArgument, CutOff, FewPoints, Flat, Gap, TwoBodies
 from torchgrasp.geometry.plane import Plane, as_plane, round_upright, upright_frame
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.silhouette import Outlines, silhouettes
@@ -31,7 +31,7 @@ from torchgrasp.shape.conditioning import (
 )
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.hollow import HollowShape, tie_walls
-from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
+from torchgrasp.shape.kernel import Kernel, KernelName, is_plain, kernel_by_name
 from torchgrasp.shape.support import (
     FREE_NOISE,
     OUTER_POINTS,
@@ -99,6 +99,10 @@ def fit_shape(
     >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
     tensor(True)
     """
+    if isinstance(kernel, Kernel) and not is_plain(kernel.profile(cloud.points.new_zeros(()))):
+        raise BadArgument(
+            "kernel", "a profile with tensors that require a gradient", "numbers: use `condition` instead"
+        )
     plane, cloud = as_plane(table), remove_duplicates(cloud)
     frame = upright_frame(cloud.points, cloud.viewpoint, plane)
     options = FitOptions(noise, budget, psi_scale, support, kernel, criterion)
@@ -127,8 +131,8 @@ def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitO
         )
     elif is_flat(cloud.points):
         _warn(Flat, "the points lie in one plane, to their noise: the thickness is a guess; give a view of two sides")
-    generator, noise = torch.Generator().manual_seed(seed), options.noise
-    up = None if table is None else torch.tensor([0.0, 0.0, 1.0])
+    generator, noise = torch.Generator("cpu").manual_seed(seed), options.noise
+    up = None if table is None else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32, device="cpu")
     seen = prepare_cloud(cloud, generator, clean=options.support == "camera", up=up)
     if options.support == "paper":
         return _fit_surface(seen, paper_support(seen, noise, generator), options)
@@ -182,7 +186,7 @@ def _fit_surface(seen: PreparedCloud, support: Support, options: FitOptions) -> 
     return shape
 
 
-@checked
+@checked(gradients=True)
 def condition(
     observations: Observations,
     normalisation: Normalisation,
@@ -193,8 +197,12 @@ def condition(
 ) -> ShapeGP:
     """Return the posterior of a shape given normalised observations, Eqs. (7)-(9) of the paper.
 
+    The posterior is differentiable, to any order, in all tensors of the observations, in the frame's centre and in
+    tensors that the kernel's profile uses. The length psi of a kernel by name and the domain's radius are constants.
+
     Args:
-        observations: signed distances and normals at points, with their noise, all normalised.
+        observations: signed distances and normals at points, with their noise, all normalised. torch.vmap may map over
+            distances, normals and noise. Then `IndefiniteCovariance` is not raised, and the estimate is NaN.
         normalisation: centre and scale of the normalised frame.
         cloud: the points that the camera saw [m].
         psi_scale: ratio of the kernel's length psi to the longest distance between observed points; the paper's value 1
@@ -203,7 +211,7 @@ def condition(
         kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
 
     Raises:
-        BadArgument: an unknown kernel.
+        BadArgument: an unknown kernel; points inside torch.vmap.
         IndefiniteCovariance: psi is too small for these observations.
 
     >>> x, noise = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2, torch.full((6,), 0.01).double()
@@ -212,11 +220,17 @@ def condition(
     >>> shape.predict(0.05 * x[:2]).distance.abs() < 0.01
     tensor([True, True])
     """
+    for name in ("x", "has_normal"):
+        if not is_known(getattr(observations, name)):
+            raise BadArgument(
+                f"observations.{name}", "a tensor inside torch.vmap", "the same for all that vmap maps over"
+            )
     observations = observations.to(normalisation.center)
     psi = psi_scale * longest_distance(observations.x)
     kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
     posterior = posterior_given(observations, kernel)
-    check_kernel(posterior, observations.least_noise)
+    if is_known(posterior.factor):
+        check_kernel(posterior, observations.least_noise)
     return ShapeGP.of(posterior, normalisation, cloud, psi, std_factor)
 
 
@@ -229,7 +243,10 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
         _warn(Gap, f"{width}: a hole, or a patch that was not measured; the surface there is a guess")
     if on_table:
         points = cloud.points.double().cpu()
-        up, spacing = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), float(nearest(points, 2)[0][:, -1].median())
+        up, spacing = (
+            torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu"),
+            float(nearest(points, 2)[0][:, -1].median()),
+        )
         body = find_second_body(points, up, spacing)
         if body is not None:
             share = float(body.double().mean())

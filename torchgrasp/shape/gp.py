@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Pose, Positive, Range, Seed, check_moved, check_tensor, checked
+from torchgrasp.base import Value, in_chunks
+from torchgrasp.checks import Pose, Positive, Range, Seed, check_moved, check_tensor, checked, is_known
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import cholesky, unit, unit_of_any
@@ -21,7 +21,6 @@ from torchgrasp.shape.values import (
     Observations,
     ShapeDerivatives,
     on_surface,
-    pass_gradients,
     surface_deviation,
 )
 from torchgrasp.values import PointCloud, ShapeEstimate
@@ -29,12 +28,13 @@ from torchgrasp.values import PointCloud, ShapeEstimate
 MAX_JOINT = 1000  # most points of one joint posterior: its memory grows with the square of their number
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ShapeGP(Posterior, Normalisation):
     """The posterior of an object's signed distance function, Eq. (1) of the paper, given observations; see `fit_shape`.
 
-    `predict`, `mean`, `mean_and_gradient`, `normalise` and `metres` are differentiable. Other methods refuse points
-    that require a gradient.
+    All methods are differentiable in the points to any order, except `update`, which refuses points that require a
+    gradient.
 
     Args:
         psi: the kernel's length psi, normalised.
@@ -59,13 +59,13 @@ class ShapeGP(Posterior, Normalisation):
     kind: str = dataclasses.field(default="guess", kw_only=True)
 
     @classmethod
-    @checked
+    @checked(gradients=True)
     def of(
         cls, posterior: Posterior, frame: Normalisation, cloud: PointCloud, psi: Positive, std_factor: Positive = 1.0
     ) -> "ShapeGP":
         """Return the shape of a posterior in a normalised frame; its domain follows from kernel and observations."""
         # Far from all observations the posterior has no information.
-        reach = 1.25 * float(torch.linalg.vector_norm(posterior.x, dim=-1).max())
+        reach = 1.25 * float(torch.linalg.vector_norm(posterior.x.detach(), dim=-1).max())
         radius = min(posterior.kernel.diameter / 2.0, reach)
         fields = common_fields(posterior, Posterior) | common_fields(frame, Normalisation)
         return cls(**fields, psi=psi, domain_radius=radius, std_factor=std_factor, cloud=cloud)
@@ -100,31 +100,19 @@ class ShapeGP(Posterior, Normalisation):
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
         """Return signed distance, normal and covariance at points [m] in the cloud's frame, Eqs. (7)-(8) of the paper.
 
-        Distance, variance and covariance are normalised by `scale` [m]. The estimate has the dtype of `points`. First
-        derivatives flow back to points that require a gradient, except from `covariance`.
+        Distance, variance and covariance are normalised by `scale` [m]. The estimate has the dtype of `points`, and is
+        differentiable in the points to any order. Inside torch.vmap the domain is not checked.
 
         Raises:
             BadArgument: non-finite numbers, or a point outside the domain, where a thin plate's variance is negative.
         """
-        covariance = points.new_empty(0)
+        mean, spread = self.estimate(self._queries(points))
+        variance = spread[:, 0, 0]
+        std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
+        parts = mean[:, 0], unit(mean[:, 1:]), variance, spread, std_m
+        return ShapeEstimate(*(_reshape(part, points) for part in parts))
 
-        def evaluate(points: Tensor) -> tuple[Tensor, ...]:
-            nonlocal covariance
-            mean, spread = self.estimate(self._queries(points))
-            variance = spread[:, 0, 0]
-            std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
-            parts = mean[:, 0], unit(mean[:, 1:]), variance, std_m, spread
-            *parts, covariance = (_reshape(part, points) for part in parts)
-            return tuple(parts)
-
-        def differentiate(points: Tensor) -> tuple[Tensor, ...]:
-            slopes = self.differentiate(points)
-            return slopes.distance, slopes.normal, slopes.variance, slopes.std_m
-
-        distance, normal, variance, std_m = pass_gradients(points, evaluate, differentiate)
-        return ShapeEstimate(distance, normal, variance, covariance, std_m)
-
-    @checked
+    @checked(gradients=True)
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
         """Return the derivatives of the results of `predict` by the query points, per metre; raises the same errors.
 
@@ -133,21 +121,19 @@ class ShapeGP(Posterior, Normalisation):
         >>> fit_shape(view).differentiate(view.points[:4]).normal.shape
         torch.Size([4, 3, 3])
         """
-        jet = self.jet(self._queries(points))
-        length = torch.linalg.vector_norm(jet.gradient, dim=-1)[:, None, None]
-        normal = jet.gradient[:, :, None] / length
-        steeper = normal.transpose(1, 2) @ jet.hessian  # the derivative of the slope
-        along = normal @ steeper
-        std = surface_deviation(jet.variance, jet.gradient)[:, None]
-        relative = jet.variance_gradient / (2 * jet.variance[:, None]) - steeper[:, 0] / length[:, 0]
-        return ShapeDerivatives(
-            distance=_reshape(jet.gradient / self.scale, points),
-            normal=_reshape((jet.hessian - along) / (length * self.scale), points),
-            variance=_reshape(jet.variance_gradient / self.scale, points),
-            std_m=_reshape(self.std_factor * std * relative, points),
-        )
 
-    @checked
+        def total(points: Tensor) -> tuple[Tensor, ...]:
+            found = self.predict(points)
+            return found.distance.sum(), found.normal.sum(0), found.variance.sum(), found.std_m.sum()
+
+        def slopes(points: Tensor) -> tuple[Tensor, ...]:
+            distance, normal, variance, std_m = torch.func.jacrev(total)(points)
+            return distance, normal.transpose(0, 1), variance, std_m
+
+        found = in_chunks(slopes, points.reshape(-1, 3), 256)
+        return ShapeDerivatives(*(_reshape(part, points) for part in found))
+
+    @checked(gradients=True)
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of distance and gradient, in normalised units, at up to 1000 points [m].
 
@@ -158,18 +144,23 @@ class ShapeGP(Posterior, Normalisation):
             raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
         return self.joint_at(x).to(points.dtype)
 
-    @checked
+    @checked(gradients=True)
     def sample(
         self, points: Float[Tensor, "k 3"], n: Annotated[int, Range(0, 1_000_000)], seed: Seed = 0
     ) -> Float[Tensor, "n k 4"]:
         """Draw n joint samples of distance and gradient, in normalised units, at up to 1000 points [m].
 
+        Samples of one seed are differentiable in the points twice, unless points coincide.
+
         Raises the errors of `predict`.
         """
         joint = self.joint(points.double())
-        root = symmetric_root(joint.covariance, float(self.prior_block()[0, 0]), "query points within the domain")
-        generator = torch.Generator().manual_seed(seed)
-        draws = torch.randn(n, len(root), dtype=torch.float64, generator=generator).to(root)
+        root = symmetric_root(
+            joint.covariance, float(self.prior_block()[0, 0].detach()), "query points within the domain"
+        )
+        generator = torch.Generator("cpu").manual_seed(seed)
+        with torch._C._DisableFuncTorch():  # the draws are the same for all that torch.vmap maps over
+            draws = torch.randn(n, len(root), dtype=torch.float64, device="cpu", generator=generator).to(self.device)
         return (joint.mean + (draws @ root).reshape(n, *joint.mean.shape)).to(points)
 
     @checked
@@ -236,11 +227,11 @@ class ShapeGP(Posterior, Normalisation):
 
     def _queries(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
         """Return query points [m] as normalised points (q, 3); raise `BadArgument` for points outside the domain."""
-        flat = points.detach().reshape(-1, 3)
+        flat = points.reshape(-1, 3)
         x = self.normalise(flat.double().to(self.device))
-        radius = torch.linalg.vector_norm(x, dim=-1)
+        radius = torch.linalg.vector_norm(x.detach(), dim=-1)
         outside = radius > self.domain_radius
-        if bool(outside.any()):
+        if is_known(outside) and bool(outside.any()):
             first = int(torch.nonzero(outside)[0])
             found = f"{int(outside.sum())} of {len(flat)} points outside the domain, the first {flat[first].tolist()} m"
             away = f"{float(radius[first]) * self.scale:.4g} m from the centre"

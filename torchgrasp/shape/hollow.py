@@ -21,6 +21,7 @@ from torchgrasp.values import PointCloud
 Found = TypeVar("Found")
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class HollowShape(ShapeGP):
     """The shape of an open vessel: the material between an outer and an inner surface, each a Gaussian process.
@@ -42,7 +43,7 @@ class HollowShape(ShapeGP):
     inner: ShapeGP
 
     @classmethod
-    @checked
+    @checked(gradients=True)
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
         """Return the vessel with two surfaces that share a normalised frame; `cloud` holds the seen points of both."""
         radius = min(outer.domain_radius, inner.domain_radius)
@@ -75,33 +76,31 @@ class HollowShape(ShapeGP):
         (a, slope_a), (b, slope_b) = (wall.mean_and_gradient(x) for wall in self.walls)
         return torch.maximum(a, b), torch.where((b > a)[:, None], slope_b, slope_a)
 
-    @checked
+    @checked(gradients=True)
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
         """Return mean and covariance of distance and gradient (d, w) at normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
 
-    @checked
+    @checked(gradients=True)
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance of the signed distance with their derivatives, at normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.jet(own))
         return map_tensors(merge, *parts)
 
-    @checked
+    @checked(gradients=True)
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean signed distance with its derivatives, at normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.mean_jet(own))
         return map_tensors(merge, *parts)
 
-    @checked
+    @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of distance and gradient (d, w) at normalised points."""
         parts, owner = [wall.joint_at(x) for wall in self.walls], self.wall_at(x)
         mean = torch.where(owner[:, 1:], parts[1].mean, parts[0].mean)
-        covariance = torch.zeros_like(parts[0].covariance)
-        for part, own in zip(parts, owner.repeat_interleave(4, 0).T, strict=True):
-            covariance += part.covariance * (own[:, None] & own)
-        return JointEstimate(mean, covariance)
+        own = [rows[:, None] & rows for rows in owner.repeat_interleave(4, 0).T]
+        return JointEstimate(mean, parts[0].covariance * own[0] + parts[1].covariance * own[1])
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
@@ -119,6 +118,10 @@ class HollowShape(ShapeGP):
         self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], Found]
     ) -> tuple[list[Found], Callable[..., Tensor]]:
         """Evaluate each wall at the points where it applies; also return a function that merges results in order."""
+        if not all(wall.is_plain(x) for wall in self.walls):
+            inner = self.wall_at(x)[:, 1]
+            walls = [evaluate(wall, x) for wall in self.walls]
+            return walls, lambda a, b: torch.where(inner.reshape(-1, *[1] * (a.ndim - 1)), b, a)
         rows = [torch.nonzero(own)[:, 0] for own in self.wall_at(x).T]
         back = torch.argsort(torch.cat(rows))
         return [evaluate(w, x[own]) for w, own in zip(self.walls, rows, strict=True)], lambda *y: torch.cat(y)[back]

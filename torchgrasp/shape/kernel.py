@@ -1,6 +1,6 @@
 """Radial kernels k(r), and the covariances of signed distances and normals that follow, Eqs. (2)-(6) of the paper.
 
-Autograd of the scalar profile k(r) defines all derivatives. A kernel may add a closed form as a speed-up.
+Autograd of the scalar profile k(r) defines all derivatives. A kernel may add a closed form, which plain tensors take.
 """
 
 import dataclasses
@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import LEAST, Positive, Range, checked
+from torchgrasp.checks import LEAST, Positive, Range, checked, is_known, is_tracked
 
 Profile = Callable[[Tensor], Tensor]
-"""A radial kernel k(r), elementwise and three times differentiable where r > 0, with k'(0) = 0."""
+"""A radial kernel k(r), elementwise, smooth where r > 0 and four times so at 0 from the right, with k'(0) = 0."""
 KernelName = Literal["thin_plate", "matern52", "rbf"]
 Orders = Annotated[int, Range(1, 4)]  # how many of k and its derivatives
 
-NEAR_ZERO = 1e-5  # below it k'(r) / r is taken as k''(r / 2), which avoids 0 / 0
+NEAR_ZERO = 1e-4  # below it k(r) is taken as its Taylor polynomial of degree 4, as k'(r) / r is 0 / 0 at r = 0
 
 
 @checked
@@ -29,13 +29,15 @@ class Kernel:
     """A radial kernel k(r) of normalised distances r, with its derivatives by r^2 / 2.
 
     Each derivative is (1/r) d/dr of the one before: k, k'/r, (k'/r)'/r, and so on; they are not k', k'', k'''.
+    Autograd of the profile defines them. Gradients also reach tensors that the profile itself uses, such as a length.
 
     Args:
         profile: the function k(r).
         diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it is a covariance
             everywhere.
         remedy: fix that the error suggests if the covariance is not positive definite.
-        closed_form: function of `r` and `count` that returns these derivatives faster than autograd, the default.
+        closed_form: function of `r` and `count` that returns these derivatives faster, or False. It serves plain
+            tensors; where a gradient is needed, the profile's derivatives are taken by autograd.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]
@@ -45,58 +47,83 @@ class Kernel:
     profile: Profile
     diameter: Annotated[float, Range(LEAST, math.inf)] = math.inf
     remedy: str = "use more noise, or a shorter length of the kernel"
-    closed_form: Callable[[Tensor, int], tuple[Tensor, ...]] | None = None
+    closed_form: Callable[[Tensor, int], tuple[Tensor, ...]] | Literal[False] = False
 
-    @checked
+    @checked(gradients=True)
     def derivatives(self, r: Float[Tensor, "*s"], count: Orders) -> tuple[Float[Tensor, "*s"], ...]:
         """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, elementwise; see `differentiate`."""
-        return differentiate(self.profile, r, count) if self.closed_form is None else self.closed_form(r, count)
+        if self.closed_form and is_plain(r):
+            return self.closed_form(r, count)
+        return differentiate(self.profile, r * r / 2, count)
 
 
-def differentiate(profile: Profile, r: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
-    """Return k and its derivatives in u = r^2 / 2 by autograd, `count` in all, at most 4.
+def is_plain(*tensors: Tensor) -> bool:
+    """Return whether torch neither differentiates the tensors nor maps over them, so that buffers may be reused."""
+    return all(is_known(x) and not is_tracked(x) for x in tensors)
 
-    Second and third are set to 0 at r = 0, where they may be infinite: covariances multiply them by a power of r.
+
+def differentiate(profile: Profile, u: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
+    """Return k and its derivatives by u = r^2 / 2, by autograd, `count` in all, at most 4.
+
+    They are differentiable by u to any order. A derivative that is infinite at r = 0 counts as 0 there: covariances
+    multiply it by a power of r.
     """
-    k, *by_r = _differentiate_by_distance(profile, r, max(count - 1, 1))
-    *_, midpoint = _differentiate_by_distance(profile, r / 2, 2)
-    positive = torch.where(r > 0, r, 1.0)
-    values = [k, torch.where(r < NEAR_ZERO, midpoint, by_r[0] / positive)]
+    near = u < NEAR_ZERO**2 / 2
+    r = torch.sqrt(2.0 * torch.where(near, NEAR_ZERO**2 / 2, u))
+    values, inverse = _differentiate_by_distance(profile, r, count - 1), 1.0 / r
+    if count > 1:
+        values[1] = values[1] * inverse
     if count > 2:
-        values.append(torch.where(r > 0, (by_r[1] - values[1]) / positive**2, 0.0))
+        values[2] = (values[2] - values[1]) * inverse**2
     if count > 3:
-        third = (by_r[2] / positive - 3.0 * values[2]) / positive**2
-        values.append(torch.where(r < NEAR_ZERO, 0.0, third))
-    return tuple(values[:count])
+        values[3] = (values[3] * inverse - 3.0 * values[2]) * inverse**2
+    if is_known(near) and not bool(near.any()):
+        return tuple(values)
+    k, _, second, third, fourth = _differentiate_by_distance(profile, u.new_zeros(()), 4)
+    apart = 2.0 * u > torch.finfo(u.dtype).eps ** 1.5  # closer points coincide: rounding of `third` would dominate
+    r = torch.where(apart, torch.sqrt(2.0 * torch.where(apart, u, 1.0)), 0.0)  # its gradient is finite at 0, too
+    inverse = torch.where(apart, 1.0 / torch.where(apart, r, 1.0), 0.0)
+    series = (
+        k + u * (second + u * fourth / 6.0) + r**3 * third / 6.0,
+        second + u * fourth / 3.0 + r * third / 2.0,
+        fourth / 3.0 + inverse * third / 2.0,
+        -(inverse**3) * third / 2.0,
+    )
+    return tuple(torch.where(near, a, b) for a, b in zip(series, values, strict=False))
 
 
 def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[Tensor]:
-    """Return the profile k(r) and its derivatives by r up to an order, elementwise."""
-    with torch.enable_grad():
-        r = r.detach().requires_grad_()
-        values = [profile(r)]
-        for _ in range(order):
-            value = values[-1] + 0.0 * r  # a constant would have no graph
-            values += torch.autograd.grad(value.sum(), r, create_graph=True)
-    return [value.detach() for value in values]
+    """Return the profile k(r) and its derivatives by r up to an order, elementwise and differentiable."""
+    if not order:
+        return [profile(r)]
+
+    def total(r: Tensor) -> tuple[Tensor, list[Tensor]]:
+        values = _differentiate_by_distance(profile, r, order - 1)
+        return values[-1].sum(), values
+
+    slope, values = torch.func.grad(total, has_aux=True)(r)
+    return [*values, slope]
 
 
-def thin_plate(r: Float[Tensor, "*s"], psi: float) -> Float[Tensor, "*s"]:
+def thin_plate(r: Float[Tensor, "*s"], psi: float | Float[Tensor, ""]) -> Float[Tensor, "*s"]:
     """Return 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper: it is a covariance in a ball of diameter 3/4 psi."""
     # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals need it.
     return r * r * (2.0 * r - 3.0 * psi) + psi**3
 
 
 @checked
-def thin_plate_kernel(psi: Positive) -> Kernel:
-    """Return the thin plate kernel of the length `psi`, normalised, with its derivatives in closed form.
+def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
+    """Return the thin plate kernel of the length `psi`, normalised.
+
+    Its derivatives are in closed form, or by autograd of the profile if `closed_form` is False.
 
     >>> kernel = thin_plate_kernel(psi=2.0)
     >>> kernel.diameter
     1.5
     """
     remedy = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
-    return Kernel(partial(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, partial(_differentiate_thin_plate, psi))
+    fast = closed_form and partial(_differentiate_thin_plate, psi)
+    return Kernel(partial(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, fast)
 
 
 def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
@@ -153,6 +180,8 @@ def cross_covariance(
     The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T with d = x - y and derivatives by r^2 / 2. The columns are the
     distances at all y, then each gradient component at the first `n_oriented`, which have normals.
     """
+    if not (kernel.closed_form and is_plain(x, y)):
+        return _differentiable_cross_covariance(kernel, x, y, n_oriented)
     n = len(y)
     d, r = separations(x, y)
     k, first, second = kernel.derivatives(r, 3)
@@ -173,6 +202,20 @@ def cross_covariance(
             torch.mul(tilted, d[p], out=block)
             out[p + 1, :, columns] = block
     return out
+
+
+def _differentiable_cross_covariance(
+    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], n_oriented: int
+) -> Float[Tensor, "4 q rows"]:
+    """Return the result of `cross_covariance` by operations without side effects, differentiable to any order."""
+    d = x[:, None] - y
+    k, first, second = (f[..., None] for f in differentiate(kernel.profile, (d * d).sum(-1) / 2, 3))
+    near, slope = d[:, :n_oriented], -first[:, :n_oriented]
+    one = torch.eye(3, dtype=x.dtype, device=x.device)
+    bent = slope[..., None] * one - second[:, :n_oriented, :, None] * near[..., :, None] * near[..., None, :]
+    with_distances = torch.cat([k, first * d], -1).permute(2, 0, 1)
+    with_normals = torch.cat([(slope * near)[..., None, :], bent], -2).permute(2, 0, 3, 1).flatten(2)
+    return torch.cat([with_distances, with_normals], -1)
 
 
 def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:

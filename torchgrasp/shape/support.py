@@ -68,7 +68,7 @@ def paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator)
     """Return the additional observations of the paper: the centre, and random points outside (Sec. 3.1)."""
     center = seen.points.mean(0)
     scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
-    sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, generator=generator)).to(center)
+    sphere = unit(torch.randn(OUTER_POINTS, 3, dtype=torch.float64, device="cpu", generator=generator)).to(center)
     x = torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere])
     distance = torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])])
     return Support(Normalisation(center, scale), off_surface(x, distance, noise), noise)
@@ -140,8 +140,8 @@ def vessel_supports(
     frame = frame_around(cloud.points)
     outer, inner = complete_walls(cloud, vessel, outline, table)
     hidden = join([outer.hidden, lid(vessel)])
-    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64)])
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64, device="cpu")])
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu")
     sphere = frame.metres(OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS))
 
     def anchors(points: Points, distance: Float[Tensor, "n"]) -> Observations:
@@ -156,7 +156,13 @@ def vessel_supports(
     surface = torch.cat([cloud.points[inner.seen], inner.hidden.points])
     bottom = float(surface[:, 2].min())
     over = vessel.rim + 0.5 * vessel.radius  # there the inner surface still surrounds free space: it has no lid
-    inside = axis + torch.tensor([0.5 * (bottom + vessel.rim), vessel.rim, over]).double()[:, None] * up
+    inside = (
+        axis
+        + torch.tensor([0.5 * (bottom + vessel.rim), vessel.rim, over], dtype=torch.float32, device="cpu").double()[
+            :, None
+        ]
+        * up
+    )
     around = sphere[sphere[:, 2] < vessel.rim]
     clear = torch.cat([torch.cdist(inside, surface).amin(1), -torch.cdist(around, surface).amin(1)])
     space = anchors(torch.cat([inside, around]), clear)
@@ -208,7 +214,7 @@ def free_space(outline: Outlines, frame: Normalisation, table: float | None = No
     points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
     least = outline.hull_distance(points) - OUTLINE_ERROR
     if table is not None:
-        side = scale * torch.linspace(-0.9, 0.9, 9, dtype=torch.float64)
+        side = scale * torch.linspace(-0.9, 0.9, 9, dtype=torch.float64, device="cpu")
         ground = torch.cartesian_prod(side, side) + origin[:2]
         for below in (0.003, 0.012):  # [m]
             height = torch.full_like(ground[:, :1], table - below)
@@ -232,7 +238,7 @@ def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float
     depth = float(outline.depth[outline.depth > 0].median())  # 0 beyond the image
     rays = [_rays_beside(outline, offset / depth) for offset in (0.008, 0.016)]
     middle = float((origin - outline.viewpoint) @ outline.axes[2])
-    depths = middle + scale * torch.linspace(-1.0, 1.0, 13, dtype=torch.float64)
+    depths = middle + scale * torch.linspace(-1.0, 1.0, 13, dtype=torch.float64, device="cpu")
     return (torch.cat(rays)[:, None] * depths[:, None]).reshape(-1, 3) @ outline.axes + outline.viewpoint
 
 

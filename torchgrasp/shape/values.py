@@ -1,8 +1,6 @@
 """Value classes of a shape: its normalised frame, its observations and its estimates."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,7 +8,6 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, Value
 from torchgrasp.checks import checked
-from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import Points, unit
 
 
@@ -37,6 +34,7 @@ class Normalisation(Value):
         return x * self.scale + self.center.to(x)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Observations(Batch):
     """Observed signed distances at points, and observed normals where `has_normal`; all normalised.
@@ -64,7 +62,7 @@ class Observations(Batch):
     @property
     def least_noise(self) -> float:
         """The least standard deviation of the noise of all observed values."""
-        return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).min())
+        return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).detach().min())
 
     def with_normals_first(self) -> "Observations":
         """Return the observations in another order: first those with normals."""
@@ -139,60 +137,3 @@ class ShapeDerivatives(Value):
 def surface_deviation(variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
     """Return the standard deviation of the surface along its normal, linearised from the distance's variance."""
     return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)
-
-
-Evaluate = Callable[[Tensor], tuple[Tensor, ...]]
-
-
-def pass_gradients(x: Float[Tensor, "*b 3"], evaluate: Evaluate, differentiate: Evaluate) -> tuple[Tensor, ...]:
-    """Return `evaluate(x)`; autograd uses the derivatives (*b, ..., 3) by x that `differentiate(x)` returns.
-
-    Taking second derivatives raises an error.
-    """
-    if not (x.requires_grad and torch.is_grad_enabled()):
-        return evaluate(x)
-    found = _Known.apply(x, evaluate, differentiate)
-    return found[: len(found) // 2]  # pyright: ignore[reportOptionalSubscript, reportArgumentType]
-
-
-class _Known(torch.autograd.Function):
-    """An autograd function whose derivatives by the points are given by a function, not found by autograd."""
-
-    @staticmethod
-    def forward(x: Tensor, evaluate: Any, differentiate: Any) -> tuple[Tensor, ...]:
-        return *evaluate(x.detach()), *differentiate(x.detach())
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        derivatives = output[len(output) // 2 :]
-        ctx.mark_non_differentiable(*derivatives)
-        ctx.save_for_backward(inputs[0], *derivatives)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        x, *derivatives = ctx.saved_tensors
-        total = torch.zeros_like(x)
-        for gradient, derivative in zip(gradients, derivatives, strict=False):
-            product = gradient[..., None] * derivative
-            while product.ndim > x.ndim:
-                product = product.sum(-2)
-            total = total + product
-        return _Final.apply(x, total), None, None
-
-
-class _Final(torch.autograd.Function):
-    """An autograd function that returns a gradient and raises an error if the gradient is differentiated again."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(x: Tensor, gradient: Tensor) -> Tensor:
-        return gradient.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Save nothing for the backward pass."""
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        raise BadArgument("points", "a second derivative of a shape", "first derivatives only")

@@ -51,8 +51,8 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
     axis_from_cloud = _frame(center, direction, scorer.outline)
     points = apply(axis_from_cloud, scorer.points)
     lines = _lines_from_above(points, rotate(axis_from_cloud, scorer.normals))
-    origin = torch.zeros(2, dtype=torch.float64)
-    error = torch.tensor(ROUND_ERROR, dtype=torch.float64)
+    origin = torch.zeros(2, dtype=torch.float64, device="cpu")
+    error = torch.tensor(ROUND_ERROR, dtype=torch.float64, device="cpu")
     mask = _round_body(points, lines, origin, lambda _, typical: torch.hypot(ROUNDNESS * typical, error))
     if mask is None:
         return None
@@ -136,7 +136,7 @@ def _fit_axis(points: Points, normals: Points) -> tuple[Float[Tensor, "3"], Floa
     """Return a point [m] and the direction of the axis that most lines along the normals meet, and the fit's cost."""
     starts = 12  # Gauss-Newton steps with robust weights (Cauchy) from so many directions; each narrows the weights
     direction = fibonacci_sphere(2 * starts)[:starts]
-    center, cost = points.mean(0).expand_as(direction), torch.zeros(starts, dtype=torch.float64)
+    center, cost = points.mean(0).expand_as(direction), torch.zeros(starts, dtype=torch.float64, device="cpu")
     for step in range(12):
         axes = torch.stack(across(direction), 1)
         arm = points - center[:, None]
@@ -172,8 +172,8 @@ def _frame(center: Float[Tensor, "3"], direction: Float[Tensor, "3"], outline: O
 
 def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
     """Return the rotations about z by k / n of a full circle, for k from 1 to n - 1."""
-    angle = torch.arange(1, n, dtype=torch.float64) * (2 * math.pi / n)
-    turn = torch.zeros(n - 1, 3, 3, dtype=torch.float64)
+    angle = torch.arange(1, n, dtype=torch.float64, device="cpu") * (2 * math.pi / n)
+    turn = torch.zeros(n - 1, 3, 3, dtype=torch.float64, device="cpu")
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
     turn[:, 2, 2] = 1.0
     return turn

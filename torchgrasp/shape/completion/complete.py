@@ -168,7 +168,7 @@ class _Image(Batch):
 
 def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]:
     """Split the cloud into a body of revolution and an attached part, such as a handle, or return the whole cloud."""
-    every = torch.arange(len(scorer.points))
+    every = torch.arange(len(scorer.points), device="cpu")
     if revolution is None:
         return [_Part(scorer, every, *find_planes(scorer))]
     rows, rest = every[revolution.body], every[~revolution.body]
@@ -200,7 +200,7 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
 
 def _mirror_in(scorer: SymmetryScorer, number: int, plane: Mirror, score: float) -> Callable[[_Image], _Image]:
     """Return a function that mirrors points in a plane; how images in nearby planes differ gives the points' errors."""
-    steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype)
+    steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype, device="cpu")
     near = planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps)
     weight = torch.softmax(scorer.score(near)[0] / TEMPERATURE, 0)
 

@@ -28,7 +28,7 @@ WITHIN = 0.12  # greatest loss of score against the best plane
 APART = math.cos(math.radians(25.0))  # closer planes mirror to the same points
 MAX_VIOLATION = 0.15  # greatest mean violation of free space, in [0, 1], of a plane added for the points that it hides
 SLOPE = 0.15  # a plane near the best one is dropped if its score is less by this: it matches only because it is near
-AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), 0.4
+AXIS, END_SCORE = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu"), 0.4
 """The axis of a body of revolution in its frame, and the least score of the plane that mirrors its ends."""
 Mirror = Float[Tensor, "4"]
 Mirrors = Float[Tensor, "_ 4"]
@@ -60,7 +60,7 @@ class SymmetryScorer:
         `table` is the table's height [m].
         """
         assert cloud.normals is not None
-        plane, every = None if table is None else Plane.horizontal(table), torch.arange(len(cloud))
+        plane, every = None if table is None else Plane.horizontal(table), torch.arange(len(cloud), device="cpu")
         return cls(cloud.points, cloud.normals, silhouettes(cloud), plane, table is not None, every).for_part(every)
 
     def about_axis(self, axis_from_cloud: Float[Tensor, "4 4"]) -> "SymmetryScorer":
@@ -132,7 +132,7 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, 
         directions = fibonacci_sphere(160)[:80]  # half a sphere: n and -n are one
     else:
         directions = _level_directions(24)
-        view = view * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+        view = view * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64, device="cpu")
     # From above, or from sides that are far apart, no side alone is hidden, and every plane may add points.
     across = unit(view) if float(torch.linalg.vector_norm(view)) > 0.05 else None
     grid = _plane_grid(scorer, directions)
@@ -196,7 +196,7 @@ def planes_near(
 
 def _level_directions(n: int) -> Float[Tensor, "n 3"]:
     """Return n horizontal unit vectors, evenly spaced over half a circle."""
-    angle = torch.arange(n, dtype=torch.float64) * math.pi / n
+    angle = torch.arange(n, dtype=torch.float64, device="cpu") * math.pi / n
     return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
 
 
@@ -205,7 +205,7 @@ def _plane_grid(scorer: SymmetryScorer, directions: Directions, count: int = OFF
     along = scorer.points @ directions.T
     low, high = along.amin(0), along.amax(0)
     middle, half = (low + high) / 2, ((high - low) / 2).clamp_min(0.15 * scorer.size)
-    offsets = middle[:, None] + half[:, None] * torch.linspace(-1, 1, count, dtype=torch.float64)
+    offsets = middle[:, None] + half[:, None] * torch.linspace(-1, 1, count, dtype=torch.float64, device="cpu")
     return torch.cat([directions[:, None].expand(-1, count, -1), offsets[..., None]], -1)
 
 
@@ -225,7 +225,11 @@ def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: V
 
 def _hides(directions: Directions, across: View) -> Bool[Tensor, "d"]:
     """Return which mirror planes, given by normals, can map seen points to hidden ones; all if `across` is None."""
-    return torch.ones(len(directions), dtype=torch.bool) if across is None else (directions @ across).abs() > MIN_FACING
+    return (
+        torch.ones(len(directions), dtype=torch.bool, device="cpu")
+        if across is None
+        else (directions @ across).abs() > MIN_FACING
+    )
 
 
 def _without_slope(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror) -> list[Mirror]:
@@ -265,7 +269,7 @@ def _best_plane(scorer: SymmetryScorer, planes: Mirrors, least: float) -> Mirror
 
 def _refine(scorer: SymmetryScorer, plane: Mirror) -> Mirror:
     """Return the plane of the best score nearby, after three grid searches, each half as wide as the last."""
-    steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype)
+    steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype, device="cpu")
     for width in (1.0, 0.5, 0.25):
         near = planes_near(scorer, plane, 0.06 * width * steps, 0.04 * scorer.size * width * steps)
         plane = near[scorer.score(near)[0].argmax()]

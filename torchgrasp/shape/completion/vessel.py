@@ -52,7 +52,7 @@ def find_vessel(points: Points, normals: Points) -> Vessel | None:
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     level = normals[:, :2] / slope[:, None].clamp_min(1e-9)
     middle, spread = points[:, 2].mean(), points[:, 2].std().clamp_min(1e-6)
-    exponents, top = torch.arange(4).to(points), 0.98  # noise lifts some points above the rim
+    exponents, top = torch.arange(4, device=points.device).to(points), 0.98  # noise lifts some points above the rim
     powers = ((points[:, 2:] - middle) / spread) ** exponents
     below = points[:, 2] < points[:, 2].quantile(top) - 0.002
     center = fit_axis(points, normals)
@@ -121,7 +121,7 @@ def complete_walls(cloud: PointCloud, vessel: Vessel, outline: Outlines, table: 
     """
     points, normals = cloud.points, cloud.normals
     assert normals is not None
-    every = HiddenWall(points, normals, torch.zeros(len(points), 4, dtype=points.dtype))
+    every = HiddenWall(points, normals, torch.zeros(len(points), 4, dtype=points.dtype, device="cpu"))
     outside, inside = every[vessel.body & ~vessel.inner], every[vessel.body & vessel.inner]
     seen_floor = vessel.inner & (normals[:, 2] > 0.9)
     has_floor = int(seen_floor.sum()) > 10
@@ -152,10 +152,12 @@ def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
     """Return 80 points of a wall, rotated about the axis by 23 angles, with the errors of the axis position."""
     wall = wall[farthest_points(wall.points, 80, tie=TIE)]
     turn = rotations_about_z(24)
-    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64)])
+    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64, device="cpu")])
     points = (wall.points - axis) @ turn.mT + axis
     normals = wall.normals @ turn.mT
-    moved = (torch.eye(3, dtype=torch.float64) - turn)[:, None] * CENTER_ERROR  # of a turned point with the axis
+    moved = (torch.eye(3, dtype=torch.float64, device="cpu") - turn)[
+        :, None
+    ] * CENTER_ERROR  # of a turned point with the axis
     shared = wall.shared.expand(len(turn), -1, -1).clone()
     shared[..., :2] += (normals[..., None, :] @ moved)[..., 0, :2]
     return HiddenWall(points.flatten(0, 1), normals.flatten(0, 1), shared.flatten(0, 1))
@@ -165,12 +167,12 @@ def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float
     """Return points at one height, normals up, on rings about the axis: each (share of `radius`, number of points)."""
     places = []
     for share, count in rings:
-        angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+        angle = torch.arange(count, dtype=torch.float64, device="cpu") * (2 * math.pi / count)
         places.append(share * radius * torch.stack([angle.cos(), angle.sin()], 1) + vessel.center)
     level = torch.cat(places)
     points = torch.cat([level, torch.full_like(level[:, :1], height)], 1)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(points)
-    shared = torch.zeros(len(points), 4, dtype=torch.float64)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu").expand_as(points)
+    shared = torch.zeros(len(points), 4, dtype=torch.float64, device="cpu")
     shared[:, 3] = FLOOR_ERROR
     return HiddenWall(points, up, shared)
 
