@@ -13,9 +13,11 @@ python scripts/reproduce.py grasps --out DIR  Figs. 9-12: one contact triple by 
 python scripts/reproduce.py table6 --out DIR  how often ever riskier grasps hold; table7: under five closings
 python scripts/reproduce.py deviations --out DIR  how often the paper's equations fail as written: docs/paper.md
 python scripts/reproduce.py ladder --out DIR  from the paper's chain to the library's, one stage exchanged at a time
+python scripts/reproduce.py claims            the figures of README and guides again: said, found, held
 """
 
 import tyro
+from claims.table import claims
 from paper.deviations import deviations
 from paper.fig4 import fig4
 from paper.fig6 import fig6
@@ -30,5 +32,5 @@ from paper.whole import reproduce_all
 if __name__ == "__main__":
     commands = {"all": reproduce_all, "table3": table3, "fig4": fig4, "table4": table4, "fig5": fig5}
     commands |= {"table5": table5, "fig6": fig6, "fig7": fig7, "fig8": fig8, "grasps": grasps}
-    commands |= {"table6": table6, "table7": table7, "ladder": ladder, "deviations": deviations}
+    commands |= {"table6": table6, "table7": table7, "ladder": ladder, "deviations": deviations, "claims": claims}
     tyro.extras.subcommand_cli_from_dict(commands, prog="reproduce.py", description="Figures and tables of the paper.")

@@ -1,0 +1,1 @@
+"""Figures of README and guides that `scripts/reproduce.py claims` runs again; `table.py` runs them."""

@@ -1,0 +1,155 @@
+"""Figures that are measured again."""
+
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+import trimesh
+from benchmarks.common import timed
+
+from claims.table import ROOT, Finding, claim
+from torchgrasp import ContactSpec, Scene, explain_empty, load_hand, load_object, load_scene, plan_grasps
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.data.shipped import DATA
+from torchgrasp.hand.load import find_hand
+
+HANDS, CAMERA, SPEED = "docs/hands.md", "docs/real_camera.md", "docs/results/speed.md"
+TABLE = ContactSpec(table=0.0)
+WORK = Path(tempfile.mkdtemp(prefix="claims"))
+
+
+def call(*words: str | Path) -> str:
+    """Run torchgrasp in `WORK`, and return what it prints; an exit code of 2 or more is an error."""
+    done = subprocess.run(
+        [sys.executable, "-m", "torchgrasp", *map(str, words)], cwd=WORK, capture_output=True, text=True
+    )
+    if done.returncode > 1:
+        raise RuntimeError(done.stderr.strip())
+    return done.stdout
+
+
+def found_in(text: str, pattern: str) -> str:
+    """Return what the first group of a pattern matches in a text, or the text's last line."""
+    match = re.search(pattern, text)
+    return match[1] if match else (text.strip().splitlines() or ["nothing"])[-1]
+
+
+@claim(HANDS, "index_tip 10.5 mm", "is 10.5 mm your tip's radius?")
+def leap_tip() -> Finding:
+    """Draft the LEAP hand again."""
+    (WORK / "leap.urdf").write_bytes((find_hand("leap") / "hand.urdf").read_bytes())
+    found = found_in(call("hand", "new", "leap.urdf", "--out", "mine"), r"(index_tip [\d.]+ mm)")
+    return found, found == "index_tip 10.5 mm"
+
+
+@claim(HANDS, "57.9% of 5000 random postures", "cylinder: 100 of 100 grasps", "cylinder: 66 of 99 grasps")
+def leap_check() -> Finding:
+    """Check the drafted hand; other processors round differently, so counts may differ by three."""
+    said = call("hand", "check", "mine", "--out", "mine/hand.png")
+    share = float(found_in(said, r"([\d.]+)% of 5000 random postures collide"))
+    counts = [int(x) for x in re.findall(r"cylinder: (\d+) of \d+ grasps", said)]
+    held = len(counts) == 2 and abs(counts[0] - 100) <= 3 and abs(counts[1] - 66) <= 3
+    return f"{share} %; {counts} grasps executable", held and abs(share - 57.9) < 0.5
+
+
+@claim(
+    HANDS, "held the cylinder: lifted 0.10 m, moved 3 mm and 2 deg in the hand", "to a held object in about ten minutes"
+)
+def leap_holds() -> Finding:
+    """Correct the draft as the guide does, plan, and close in the simulator; 1 mm or 1 degree more is as good."""
+    hand, began = WORK / "mine" / "hand.toml", time.perf_counter()
+    parked = 'parked = { "5" = -0.3, "4" = 0.0, "6" = -0.2, "7" = -0.3 }'
+    text = re.sub(r"(?m)^parked = .*", parked, hand.read_text("utf-8"))
+    hand.write_text(re.sub(r"(?m)^kd = .*", "kd = 0.1", re.sub(r"(?m)^kp = .*", "kp = 3.0", text)), "utf-8")
+    cylinder = DATA / "cylinder"
+    words = ("--hand", "mine", "--out", "out", "--starts", "200", "--mesh", cylinder / "mesh.ply", "--close")
+    last = call("grasp", cylinder / "view.ply", *words).strip().splitlines()[-1]
+    match = re.search(r"held the cylinder: lifted 0.10 m, moved (\d+) mm and (\d+) deg", last)
+    took = time.perf_counter() - began
+    return f"{last} ({took:.0f} s)", match is not None and int(match[1]) <= 4 and int(match[2]) <= 3 and took < 300
+
+
+@claim("docs/fingers.md", "index,middle,ring,thumb 16")
+def four_fingers() -> Finding:
+    """Load the option "four"."""
+    hand = load_hand("allegro", "four")
+    return (found := f"{','.join(hand.finger_names)} {hand.dof}"), found == "index,middle,ring,thumb 16"
+
+
+@claim("docs/planning.md", "contacts: 0 of 20 starts (20 not_closed)")
+def no_friction() -> Finding:
+    """Plan without friction."""
+    spec = ContactSpec(friction=0.0, table=0.0)
+    found = str(explain_empty(load_object("cylinder").view, load_hand("barrett"), spec, starts=20).funnel).strip()
+    return found, found == "contacts: 0 of 20 starts (20 not_closed)"
+
+
+@claim("docs/scenes.md", "four objects, one depth image", "or scene.select(4), by label")
+def shipped_scene() -> Finding:
+    """Count the objects, and click the pixel of the page."""
+    scene = load_scene()
+    label = scene.select((394, 312)).target
+    return f"{len(scene.things)} objects, label {label}", len(scene.things) == 4 and label == 4
+
+
+@claim("docs/scenes.md", "A box 5 mm high is found and one 3 mm high is not.")
+def low_boxes() -> Finding:
+    """Render boxes of both heights beside a higher one, with the noise of three cameras."""
+    camera, counts = look_at(20.0, 45.0, 0.7), list[int]()
+    for height in (0.003, 0.005):
+        low, high = trimesh.creation.box([0.1, 0.08, height]), trimesh.creation.box([0.05, 0.05, 0.06])
+        low.apply_translation([0.0, 0.0, height / 2])
+        high.apply_translation([0.0, 0.15, 0.03])
+        for noise in (True, "realsense", "zivid"):
+            depth, _ = render_depth([low, high], camera, noise=noise)
+            counts.append(len(Scene.from_depth(depth, INTRINSICS, camera).things))
+    return f"{counts[:3]} objects with 3 mm, {counts[3:]} with 5 mm", counts == [1, 1, 1, 2, 2, 2]
+
+
+@claim("docs/faq.md", "`--starts 200` is enough for compact objects")
+@claim("docs/speed.md", "`starts=200` is enough for compact objects")
+def few_starts() -> Finding:
+    """Compare the best predicted success of 200 and 1000 starts on three compact objects: it may lose 2 points."""
+    hand, lost = load_hand("allegro"), dict[str, float]()
+    for name in ("cylinder", "jug", "rabbit"):
+        few, many = (plan_grasps(load_object(name).view, hand, TABLE, starts=n).success[0] for n in (200, 1000))
+        lost[name] = float(many - few)
+    return ", ".join(f"{name} {100 * x:.1f} points less" for name, x in lost.items()), max(lost.values()) <= 0.02
+
+
+@claim(CAMERA, "in two minutes")
+def one_frame() -> Finding:
+    """Run the page's first three steps: render the frame, find the scene, grasp."""
+    code = re.findall(r"```python\n(.*?)```", (ROOT / CAMERA).read_text("utf-8"), re.DOTALL)[0]
+    began = time.perf_counter()
+    subprocess.run([sys.executable, "-c", code], cwd=WORK, check=True)
+    call("cloud", "scene", "frame.npy", "--intrinsics", "k.txt", "--out", "scene.npz")
+    call("grasp", "scene.npz", "--hand", "barrett", "--starts", "20", "--out", "out/frame")
+    took = time.perf_counter() - began
+    return f"{took:.0f} s", took < 120
+
+
+@claim(SPEED, "half of torch's own")
+def import_time() -> Finding:
+    """Time the imports of torch and of torchgrasp in new processes, and compare the least of three."""
+    code = "import time; a = time.process_time(); import {}; print(time.process_time() - a)"
+    own, both = (
+        min(float(subprocess.check_output([sys.executable, "-c", code.format(name)], text=True)) for _ in range(3))
+        for name in ("torch", "torchgrasp")
+    )
+    return f"{both - own:.2f} s beyond {own:.2f} s of torch", 0.3 < both / own - 1 < 0.7
+
+
+@claim(SPEED, "| first executable grasp, cloud to answer | median 0.6 s, worst 1.2 s |")
+def first_grasp() -> Finding:
+    """Time the first batch on the four shipped objects by the processor's clock, after a first plan."""
+    hand, took = load_hand("allegro"), list[float]()
+    for name in ("cylinder", "cylinder", "jug", "rabbit", "spray"):
+        grasps, seconds = timed(lambda name=name: plan_grasps(load_object(name).view, hand, TABLE, time_budget=1e-3))
+        took.append(seconds if int((grasps.status == 0).sum()) else torch.inf)
+    median, worst = sorted(took[1:])[2], max(took[1:])
+    return f"median {median:.2f} s, worst {worst:.2f} s", median < 0.6 and worst < 1.2
