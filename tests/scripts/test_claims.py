@@ -1,14 +1,16 @@
 """Figures of README and guides: each is measured again by `scripts/reproduce.py claims`, or is a limit or a default."""
 
+import dataclasses
 import inspect
 import re
 from pathlib import Path
 
 import pytest
-from benchmarks.common import ROOT
+from benchmarks.common import ROOT, Options
 from claims import measured, table
 
 from torchgrasp import ContactSpec, TrialSpec, limits
+from torchgrasp.app.cli import COMMANDS
 from torchgrasp.app.cli.inputs import MOST_POINTS
 from torchgrasp.cloud.check import FEW_POINTS
 from torchgrasp.cloud.parts import GAP
@@ -118,3 +120,36 @@ def test_claims_end_with_1_where_one_does_not_hold(monkeypatch, capsys):
         table.claims()
     said = capsys.readouterr().out
     assert said.endswith("1 of 3 hold\n") and "says so no more" in said and "ZeroDivisionError" in said
+
+
+RESULTS = sorted((ROOT / "docs" / "results").glob("*.md"))
+COMMAND = re.compile(r"`((?:scripts/\w+\.py|torchgrasp|pytest)\b[^`]*)`(.{0,40})", re.DOTALL)
+
+
+@pytest.mark.parametrize("path", [path for path in RESULTS if path.stem != "index"], ids=lambda path: path.stem)
+def test_each_table_of_results_names_machine_command_and_commit(path):
+    text = path.read_text("utf-8")
+    assert re.search(r"AMD|Intel|NVIDIA|threads", text)
+    head, *sections = re.split(r"^## ", text, flags=re.MULTILINE)
+    for section in sections or [head]:
+        if "| --- |" in section:
+            title = section.splitlines()[0]
+            assert re.search(r"\b[Cc]ommits? [0-9a-f]{7}", section + head), title
+            assert COMMAND.search(section + head), title
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.stem)
+def test_commands_of_results_exist_and_take_their_flags(path):
+    for words, after in COMMAND.findall(path.read_text("utf-8")):
+        script, *rest = words.split()
+        flags = {x for x in rest if x.startswith("--")}
+        if "at commit" in after or script == "pytest" or words == "torchgrasp --help":
+            continue
+        if script == "torchgrasp":
+            assert any(words.startswith(f"torchgrasp {name}") for name in COMMANDS), words
+        else:
+            assert (ROOT / script).is_file(), words
+        if script == "scripts/bench.py" and rest[0] != "NAME":
+            assert {x[2:] for x in flags} <= {field.name for field in dataclasses.fields(Options)}, words
+        if script == "scripts/reproduce.py":
+            assert f'"{rest[0]}": ' in (ROOT / script).read_text("utf-8"), words
