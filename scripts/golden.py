@@ -172,7 +172,7 @@ def run_command(words: str) -> str:
 JOBS: dict[str, tuple[Callable[..., str], list[tuple[Any, ...]]]] = {
     "plan": (plan, [(*view, hand, mode) for view in VIEWS for hand in HANDS for mode in MODES]),
     "close": (close, [(name, hand, how) for how in CLOSINGS for name in OBJECTS[:2] for hand in HANDS]),
-    "lift": (lift, [(k,) for k in range(6)]),
+    "lift": (lift, [(k,) for k in range(8)]),
     "export": (export, [(name, hand) for name in OBJECTS[:2] for hand in HANDS]),
     "command": (run_command, [(words,) for words in COMMANDS]),
 }

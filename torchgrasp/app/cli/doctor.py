@@ -67,7 +67,7 @@ def find_parts() -> list[Finding]:
 
 @arguments()
 class Selftest(Command):
-    """Lift six shipped grasps in each installed simulator, and compare the verdicts with the known ones.
+    """Lift shipped grasps in each installed simulator, and compare the verdicts with the known ones.
 
     The exit code is 0 if all verdicts are right, and 1 if one is wrong or no simulator is installed.
     """
@@ -94,7 +94,7 @@ class Selftest(Command):
         rows, words = [("object", "hand", "expected", *found)], {True: "held", False: "lost"}
         for k, case in enumerate(GOLDEN):
             verdicts = [f"{words[x[k].held]}{'' if x[k].right else ' (wrong)'}" for x in found.values()]
-            rows.append((case.object, case.hand, words[case.held], *verdicts))
+            rows.append((f"{case.object}, {case.mass:g} kg", case.hand, words[case.held], *verdicts))
         print(f"\n{format_columns(rows, left=range(len(rows[0])))}")
         return 0 if all(x.right for results in found.values() for x in results) else 1
 
