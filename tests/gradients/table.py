@@ -1,0 +1,229 @@
+"""The table of gradients: each public function of tensors with the derivatives that it has.
+
+A row of `ROWS` is a differentiable function. `MASKS` take tensors by which derivatives are taken, but their results have
+no derivatives. All others refuse such tensors.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from tests.hostile.samples import few_points
+from torchgrasp import Contacts, ContactSpec, Hand, Plane, certify, encode, fit_shape, load_hand
+from torchgrasp.base import named_tensors
+from torchgrasp.control import squeeze
+from torchgrasp.data.shipped import load_shipped_grasp
+from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.posture_model import GaussianMixture, GraspMixture
+from torchgrasp.posture_model.mixture import CODE_NAMES
+from torchgrasp.shape import matern52_kernel, rbf_kernel, thin_plate_kernel
+from torchgrasp.shape.hollow import HollowShape
+from torchgrasp.testing import random_joints
+
+Function = Callable[..., Any]
+Make = Callable[[torch.dtype], tuple[Function, tuple[Tensor, ...]]]
+TWICE, ONCE = 2, 1
+JOINTS, POINTS, CODES = "joints", "points", "codes, parameters"
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A differentiable function: in what, how often, and what makes a function of tensors with arguments for it.
+
+    The first `batched` arguments may have more leading axes. `lacks` are checks that it does not pass.
+    """
+
+    by: str
+    order: int
+    make: Make
+    batched: int = 0
+    note: str = ""
+    lacks: tuple[str, ...] = ()
+
+
+def outputs(result: Any) -> tuple[Tensor, ...]:
+    """Return the floating-point tensors of a result."""
+    if isinstance(result, Tensor):
+        return (result,) if result.is_floating_point() else ()
+    if isinstance(result, dict):
+        return tuple(result.values())
+    parts = result if isinstance(result, tuple) else tuple(named_tensors(result).values())
+    return tuple(x for part in parts for x in outputs(part))
+
+
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64, device="cpu")
+
+
+def of_contacts(function: Function) -> Make:
+    """Return what makes a function of points and normals of three sets of contacts."""
+
+    def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+        points = 0.05 * draw(3, 3, 3)
+        normals = normalize(points - points.mean(1, keepdim=True) + 0.01 * draw(3, 3, 3, seed=1), dim=-1)
+        return function, (points.to(dtype), normals.to(dtype))
+
+    return make
+
+
+def margin(points: Tensor, normals: Tensor) -> Tensor:
+    return certify(Contacts(points, normals), ContactSpec()).margin
+
+
+def code(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+    found = encode((points, normals))
+    return found.q, found.obj_from_vf
+
+
+def of_mixture(
+    kind: type[GaussianMixture], names: tuple[str, ...], query: Function, width: int, weighted: bool = True
+) -> Make:
+    """Return what makes a function of rows and of a mixture's parameters; weights are a softmax."""
+    d = len(names)
+    root, means, logits = 0.3 * draw(2, d, d) + torch.eye(d, device="cpu"), draw(2, d, seed=1), draw(2, seed=2)
+
+    def function(x: Tensor, means: Tensor, root: Tensor, logits: Tensor = torch.zeros(2)) -> Any:
+        covariances = root @ root.mT
+        covariances = (covariances + covariances.mT) / 2
+        return query(kind(torch.softmax(logits, 0), means, covariances, names), x)
+
+    def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+        inputs = means[:, -width:] + 0.5, means, root, logits
+        return function, tuple(x.to(dtype) for x in inputs[: 3 + weighted])
+
+    return make
+
+
+@functools.cache
+def hand_of(dtype: torch.dtype) -> Hand:
+    return load_hand("barrett").to(dtype)
+
+
+def of_hand(method: str) -> Make:
+    """Return what makes a method of a hand, a function of two postures."""
+
+    def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+        hand = hand_of(dtype).to("cpu")  # without what other calls have kept
+        return getattr(hand, method), (random_joints(hand, 2, 0).to(dtype),)
+
+    return make
+
+
+def of_part(part: str, method: str, argument: Function) -> Make:
+    """Return what makes a method of a part of a hand, a function of what `argument` computes from joints."""
+
+    def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+        hand = hand_of(dtype).to("cpu")
+        return getattr(getattr(hand, part), method), (argument(hand, random_joints(hand, 2, 0).to(dtype)),)
+
+    return make
+
+
+def values_of(hand: Hand, joints: Tensor) -> Tensor:
+    return hand.actuated.expand(joints).mT
+
+
+def of_field(method: Function) -> Make:
+    """Return what makes a method that takes points near the origin."""
+    return lambda dtype: (method(dtype), (0.05 * draw(4, 3).to(dtype),))
+
+
+def ball() -> SignedDistanceField:
+    axis = torch.linspace(-0.2, 0.2, 21, dtype=torch.float64, device="cpu")
+    return SignedDistanceField(
+        axis[[0, 0, 0]], 0.02, torch.cartesian_prod(axis, axis, axis).norm(dim=1).view(21, 21, 21)
+    )
+
+
+def pressed_joints(dtype: torch.dtype) -> Tensor:
+    return load_shipped_grasp("jug", "barrett").joints.to(dtype)
+
+
+def pressed(joints: Tensor) -> Any:
+    grasps = load_shipped_grasp("jug", "barrett")
+    return squeeze(load_hand("barrett"), dataclasses.replace(grasps, joints=joints))
+
+
+CODE = ("j", *CODE_NAMES)
+PLAIN = ("a", "b")
+GAUSSIAN, GRASP = "torchgrasp.posture_model.gaussian.GaussianMixture", "torchgrasp.posture_model.mixture.GraspMixture"
+
+
+def densities(owner: str, kind: type[GaussianMixture], names: tuple[str, ...]) -> dict[str, Row]:
+    """Return the rows of the methods that both kinds of mixtures have."""
+    rest, given = names[1:], {names[0]: 0.3}
+    queries: dict[str, tuple[Function, int, int]] = {
+        "log_prob": (lambda mixture, x: mixture.log_prob(x), len(names), 1),
+        "log_joint": (lambda mixture, x: mixture.log_joint(x), len(names), 0),
+        "marginal": (lambda mixture, x: mixture.marginal(rest).log_prob(x), len(rest), 0),
+        "condition": (lambda mixture, x: mixture.condition(given).log_prob(x), len(rest), 0),
+    }
+    by = {"marginal": "parameters", "condition": "parameters"}
+    return {
+        f"{owner}.{name}": Row(
+            by.get(name, "points, parameters"), TWICE, of_mixture(kind, names, query, width), batched
+        )
+        for name, (query, width, batched) in queries.items()
+    }
+
+
+ROWS: dict[str, Row] = {
+    "torchgrasp.plan.certify.certify": Row(
+        "contacts, for the margin", ONCE, of_contacts(margin), note="by the dual; a subgradient where it is not unique"
+    ),
+    "torchgrasp.posture_model.mixture.encode": Row("points, normals", TWICE, of_contacts(code)),
+    **densities(GAUSSIAN, GaussianMixture, PLAIN),
+    **densities(GRASP, GraspMixture, CODE),
+    f"{GRASP}.energy": Row(
+        "codes, means, covariances",
+        TWICE,
+        of_mixture(GraspMixture, CODE, lambda m, q: m.energy(q), 6, weighted=False),
+        note="a minimum over components",
+    ),
+    f"{GRASP}.joints": Row(CODES, TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.joints(q), 6)),
+    f"{GRASP}.modes": Row(
+        CODES, TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.modes(q, 2), 6), note="the k largest"
+    ),
+    "torchgrasp.control.forces.squeeze": Row("joints", TWICE, lambda dtype: (pressed, (pressed_joints(dtype),))),
+    **{
+        f"torchgrasp.hand.hand.Hand.{name}": Row("joints", TWICE, of_hand(name), 1)
+        for name in "check_joints expand expand_joints fingertips jacobian link_poses sphere_centres tip_centres".split()
+    },
+    "torchgrasp.hand.hand.Hand.self_clearance": Row(
+        "joints", TWICE, of_hand("self_clearance"), 1, note="the least of all pairs"
+    ),
+    **{
+        f"torchgrasp.hand.fingers.ActuatedJoints.{name}": Row(
+            "joints", TWICE, of_part("actuated", name, lambda _, q: q), 1
+        )
+        for name in ("couple", "expand")
+    },
+    "torchgrasp.hand.fingers.Fingertips.frames": Row("values", TWICE, of_part("tips", "frames", values_of)),
+    "torchgrasp.hand.kinematics.KinematicTree.frames": Row("values", TWICE, of_part("tree", "frames", values_of)),
+    "torchgrasp.hand.kinematics.KinematicTree.poses": Row(
+        "values", TWICE, of_part("tree", "poses", lambda h, q: h.actuated.expand(q))
+    ),
+    "torchgrasp.hand.kinematics.KinematicTree.joint_axes": Row(
+        "poses", TWICE, of_part("tree", "joint_axes", lambda h, q: h.link_poses(q)), 1
+    ),
+    **{
+        f"torchgrasp.hand.self_collision.SelfCollision.{name}": Row(
+            "frames", TWICE, of_part("self_collision", name, lambda h, q: h.tree.frames(values_of(h, q)))
+        )
+        for name in ("clearance", "separations", "pushes")
+    },
+    "torchgrasp.geometry.plane.Plane.height": Row("points", TWICE, of_field(lambda _: Plane.horizontal(0.1).height), 1),
+    "torchgrasp.geometry.signed_distance.SignedDistanceField.query": Row(
+        "points", ONCE, of_field(lambda _: ball().query), 1, note="inside a cell of the grid"
+    ),
+}
+MASKS = {
+    "torchgrasp.hand.fingers.ActuatedJoints.check", "torchgrasp.hand.fingers.ActuatedJoints.check_limits",
+    "torchgrasp.hand.self_collision.SelfCollision.count_near",
+}  # fmt: skip
+"""Functions that count, choose or check: they take differentiated tensors, and their results have no derivatives."""

@@ -1,0 +1,200 @@
+"""Each row of the table of gradients under every transform and setting, and the table beside the public functions."""
+
+import copy
+import inspect
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad, gradcheck, gradgradcheck
+from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
+
+from tests.gradients.table import MASKS, ROWS, Function, Row, draw, outputs
+from tests.hostile.arguments import checked_things, required
+from torchgrasp.base import Value, map_tensors
+from torchgrasp.errors import BadArgument
+
+F64, ROOT = torch.float64, Path(__file__).parents[2]
+QUICK = ["torchgrasp.posture_model.mixture.encode", "torchgrasp.posture_model.gaussian.GaussianMixture.log_joint"]
+"""Rows that are compiled in a quick run."""
+STEP = 1e-6
+THINGS = checked_things()
+
+
+def scalar(function: Function) -> Callable[..., Tensor]:
+    """Return a function that sums all results of a function with fixed weights."""
+
+    def total(*x: Tensor) -> Tensor:
+        found = outputs(function(*x))
+        weights = [torch.linspace(0.5, 1.5, y.numel(), dtype=y.dtype, device="cpu").view(y.shape) for y in found]
+        return sum((w * y).sum() for w, y in zip(weights, found, strict=True))
+
+    return total
+
+
+def near(found: Any, expected: Any, tolerance: float = 1e-7) -> None:
+    torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance)
+
+
+def every(x: tuple[Tensor, ...]) -> tuple[int, ...]:
+    return tuple(range(len(x)))
+
+
+def slopes(function: Function, x: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Return the derivatives of the sum of all results, by `backward`."""
+    leaves = tuple(v.detach().clone().requires_grad_() for v in x)
+    return torch.autograd.grad(scalar(function)(*leaves), leaves)
+
+
+def compile_rows(names: list[str]) -> None:
+    """Compare rows with themselves behind `torch.compile`; print the names of those that agree."""
+    for name in names:
+        torch.compiler.reset()
+        function, x = ROWS[name].make(F64)
+        compiled = torch.compile(lambda *v: outputs(function(*v)), backend="eager")  # noqa: B023
+        near(compiled(*x), outputs(function(*x)))
+        near(slopes(compiled, x), slopes(function, x))
+        print(name)
+
+
+def check_backward(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    """Reverse and forward mode agree with finite differences, and no derivative is zero everywhere."""
+    leaves = tuple(v.clone().requires_grad_() for v in x)
+    assert gradcheck(lambda *v: outputs(f(*v)), leaves, fast_mode=True, check_forward_ad=True)
+    assert all(bool(v.any()) for v in slopes(f, x))
+
+
+def check_double_backward(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    leaves = tuple(v.clone().requires_grad_() for v in x)
+    if row.order > 1:
+        assert gradgradcheck(scalar(f), leaves, fast_mode=True)
+        return
+    first = torch.autograd.grad(scalar(f)(*leaves), leaves, create_graph=True)
+    with pytest.raises(BadArgument, match="second derivative"):
+        torch.autograd.grad(sum(v.sum() for v in first), leaves)
+
+
+def check_jacobians(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    one, other = (how(lambda *v: outputs(f(*v)), every(x))(*x) for how in (jacrev, jacfwd))
+    near(one, other)
+
+
+def check_hessian(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    """Hessians are symmetric, and they are the finite differences of gradients."""
+    if row.order < 2:
+        for how in (hessian, lambda g: jacrev(jacrev(g)), lambda g: jacfwd(jacfwd(g)), lambda g: jacrev(jacfwd(g))):
+            with pytest.raises(BadArgument, match="second derivative"):
+                how(scalar(f))(*x)
+        return
+    found = hessian(scalar(f))(*x).reshape(x[0].numel(), x[0].numel())
+    near(found, found.T)
+    way = draw(*x[0].shape, seed=7)
+    after, before = (grad(scalar(f))(x[0] + sign * STEP * way, *x[1:]) for sign in (1, -1))
+    near((found @ way.flatten()).view_as(way), (after - before) / (2 * STEP), 1e-5)
+
+
+def check_vmap(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    """A call over an axis is a loop over it, and so are its gradients."""
+    other = tuple(v + 1e-4 * draw(*v.shape, seed=3) for v in x)
+    both = tuple(torch.stack(pair) for pair in zip(x, other, strict=True))
+    total = scalar(f)
+    near(
+        vmap(lambda *v: outputs(f(*v)))(*both),
+        tuple(map(torch.stack, zip(outputs(f(*x)), outputs(f(*other)), strict=True))),
+    )
+    loop = zip(grad(total, every(x))(*x), grad(total, every(x))(*other), strict=True)
+    near(vmap(grad(total, every(x)))(*both), tuple(map(torch.stack, loop)))
+
+
+def check_jvp(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    way = tuple(draw(*v.shape, seed=5) for v in x)
+    value, change = jvp(lambda *v: outputs(f(*v)), x, way)
+    after, before = (outputs(f(*(v + sign * STEP * w for v, w in zip(x, way, strict=True)))) for sign in (1, -1))
+    near(value, outputs(f(*x)))
+    near(change, tuple((a - b) / (2 * STEP) for a, b in zip(after, before, strict=True)), 1e-5)
+
+
+def check_single(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    """In single precision values and gradients are those of double precision."""
+    single, y = row.make(torch.float32)
+    near(tuple(v.double() for v in outputs(single(*y))), outputs(f(*x)), 2e-3)
+    found = slopes(single, y)
+    assert all(v.dtype == torch.float32 for v in found)
+    for one, other in zip(found, slopes(f, x), strict=True):
+        near(one.double(), other, 5e-3 * max(1.0, float(other.abs().max())))
+
+
+def check_axes(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    """More leading axes give the same rows."""
+    if row.batched:
+        k = row.batched
+        found = outputs(f(*(torch.stack([v, v]) for v in x[:k]), *x[k:]))
+        near(found, tuple(torch.stack([y, y]) for y in outputs(f(*x))))
+
+
+def check_default_device(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    """With another default device, whose tensors have no numbers, nothing changes."""
+    expected, expected_slopes = outputs(f(*x)), slopes(f, x)
+    with torch.device("meta"):
+        near(outputs(f(*x)), expected)
+        near(slopes(f, x), expected_slopes)
+
+
+def check_default_dtype(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    expected, expected_slopes = outputs(f(*x)), slopes(f, x)
+    torch.set_default_dtype(F64)
+    try:
+        near(outputs(f(*x)), expected)
+        near(slopes(f, x), expected_slopes)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def check_order_of_calls(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    """What a first call keeps, in inference mode or inside a transform, spoils no later gradient."""
+    expected, expected_slopes = outputs(f(*x)), slopes(f, x)
+    for first in (inferred, jacrev, jacfwd):
+        fresh, y = row.make(F64)
+        first(lambda *v: outputs(fresh(*v)))(*y)
+        near(slopes(fresh, y), expected_slopes)
+        near(outputs(fresh(*y)), expected)
+        assert not any(v.requires_grad for v in outputs(fresh(*y)))
+        owner = getattr(fresh, "__self__", None)
+        if owner is not None:
+            pickle.dumps(owner)
+
+
+def inferred(function: Function) -> Function:
+    def call(*x: Tensor) -> Any:
+        with torch.inference_mode():
+            return function(*x)
+
+    return call
+
+
+CHECKS = {name.removeprefix("check_"): check for name, check in globals().items() if name.startswith("check_")}
+
+
+@pytest.mark.parametrize("check", CHECKS)
+@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.filterwarnings("ignore")  # torch warns of its own forward mode and compiler
+def test_a_row_of_the_table(name: str, check: str):
+    row = ROWS[name]
+    if check in row.lacks:
+        pytest.skip("the table says that it lacks this")
+    CHECKS[check](row, *row.make(F64))
+
+
+@pytest.mark.parametrize("names", [QUICK, pytest.param([*ROWS], marks=pytest.mark.slow)], ids=["some", "all"])
+def test_compiled_rows_are_the_same(names: list[str]):
+    """In a process of its own: the checks of annotations, which tests add to each function, cannot be compiled."""
+    names = [name for name in names if "compile" not in ROWS[name].lacks]
+    code = f"from tests.gradients.test_table import compile_rows; compile_rows({names})"
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.split() == names, done.stderr[-3000:]
