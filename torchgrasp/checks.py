@@ -145,7 +145,18 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
         inner = dataclasses.replace(call, sizes={})  # the letters of a value are its own
         for field, of_field in _fields(type(value)).items():
             _read(f"{name}.{field}", getattr(value, field), of_field, inner)
+    elif call.deep and not call.gradients and dataclasses.is_dataclass(value):
+        _refuse_gradients(name, value)
     return value
+
+
+def _refuse_gradients(name: str, value: Any) -> None:
+    """Raise `BadArgument` if derivatives are taken by a tensor of a value whose fields are not checked."""
+    for field, x in vars(value).items():
+        if isinstance(x, Tensor):
+            check_dense(f"{name}.{field}", x, gradients=False)
+        elif dataclasses.is_dataclass(x):
+            _refuse_gradients(f"{name}.{field}", x)
 
 
 def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:

@@ -1,11 +1,10 @@
 """Each row of the table of gradients under every transform and setting, and the table beside the public functions."""
 
-import copy
 import inspect
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,52 +14,17 @@ from torch import Tensor
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
-from tests.gradients.table import MASKS, ROWS, Function, Row, draw, outputs
+from tests.gradients.compare import F64, every, near, scalar, slopes
+from tests.gradients.table import MASKS, PENDING, ROWS, Function, Row, draw, outputs
 from tests.hostile.arguments import checked_things, required
-from torchgrasp.base import Value, map_tensors
+from torchgrasp.base import Value, map_tensors, named_tensors
 from torchgrasp.errors import BadArgument
 
-F64, ROOT = torch.float64, Path(__file__).parents[2]
-QUICK = ["torchgrasp.posture_model.mixture.encode", "torchgrasp.posture_model.gaussian.GaussianMixture.log_joint"]
+ROOT = Path(__file__).parents[2]
+QUICK = ["torchgrasp.posture_model.gaussian.GaussianMixture.log_joint"]
 """Rows that are compiled in a quick run."""
 STEP = 1e-6
 THINGS = checked_things()
-
-
-def scalar(function: Function) -> Callable[..., Tensor]:
-    """Return a function that sums all results of a function with fixed weights."""
-
-    def total(*x: Tensor) -> Tensor:
-        found = outputs(function(*x))
-        weights = [torch.linspace(0.5, 1.5, y.numel(), dtype=y.dtype, device="cpu").view(y.shape) for y in found]
-        return sum((w * y).sum() for w, y in zip(weights, found, strict=True))
-
-    return total
-
-
-def near(found: Any, expected: Any, tolerance: float = 1e-7) -> None:
-    torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance)
-
-
-def every(x: tuple[Tensor, ...]) -> tuple[int, ...]:
-    return tuple(range(len(x)))
-
-
-def slopes(function: Function, x: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Return the derivatives of the sum of all results, by `backward`."""
-    leaves = tuple(v.detach().clone().requires_grad_() for v in x)
-    return torch.autograd.grad(scalar(function)(*leaves), leaves)
-
-
-def compile_rows(names: list[str]) -> None:
-    """Compare rows with themselves behind `torch.compile`; print the names of those that agree."""
-    for name in names:
-        torch.compiler.reset()
-        function, x = ROWS[name].make(F64)
-        compiled = torch.compile(lambda *v: outputs(function(*v)), backend="eager")  # noqa: B023
-        near(compiled(*x), outputs(function(*x)))
-        near(slopes(compiled, x), slopes(function, x))
-        print(name)
 
 
 def check_backward(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
@@ -161,7 +125,7 @@ def check_order_of_calls(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
     expected, expected_slopes = outputs(f(*x)), slopes(f, x)
     for first in (inferred, jacrev, jacfwd):
         fresh, y = row.make(F64)
-        first(lambda *v: outputs(fresh(*v)))(*y)
+        first(lambda *v, fresh=fresh: outputs(fresh(*v)))(*y)
         near(slopes(fresh, y), expected_slopes)
         near(outputs(fresh(*y)), expected)
         assert not any(v.requires_grad for v in outputs(fresh(*y)))
@@ -195,6 +159,73 @@ def test_a_row_of_the_table(name: str, check: str):
 def test_compiled_rows_are_the_same(names: list[str]):
     """In a process of its own: the checks of annotations, which tests add to each function, cannot be compiled."""
     names = [name for name in names if "compile" not in ROWS[name].lacks]
-    code = f"from tests.gradients.test_table import compile_rows; compile_rows({names})"
+    code = f"from tests.gradients.compare import compile_rows; compile_rows({names})"
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout.split() == names, done.stderr[-3000:]
+
+
+def test_the_table_has_public_functions_alone():
+    assert {*ROWS, *MASKS} <= {*THINGS} and not {*ROWS} & {*MASKS}
+
+
+def has_numbers(value: Any) -> bool:
+    """Return whether an argument has floating-point tensors, itself or inside."""
+    if isinstance(value, Value):
+        return any(x.is_floating_point() for x in named_tensors(value).values())
+    parts = value if isinstance(value, tuple | list) else ()
+    return value.is_floating_point() if isinstance(value, Tensor) else any(map(has_numbers, parts))
+
+
+def changed(function: Function, value: Any) -> Any:
+    """Return an argument with all its floating-point tensors replaced by those that a function returns."""
+    if isinstance(value, tuple | list):
+        parts = [changed(function, part) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    if isinstance(value, Value):
+        return map_tensors(lambda x: changed(function, x), value)
+    return function(value) if isinstance(value, Tensor) and value.is_floating_point() else value
+
+
+def refusing(call: Function, arguments: dict[str, Any], key: str) -> Iterator[tuple[str, Function]]:
+    """Yield calls of a function with an argument by which derivatives are taken, in each way of torch."""
+
+    def with_argument(function: Function) -> Any:
+        try:
+            argument = changed(function, arguments[key])
+        except Exception as error:  # a value that cannot be made inside the transform
+            raise BadArgument(key, "no value", "a value") from error
+        return call(**arguments | {key: argument})
+
+    def dual() -> Any:
+        with forward_ad.dual_level():
+            return with_argument(lambda x: forward_ad.make_dual(x, torch.ones_like(x)))
+
+    shifted = lambda shift: with_argument(lambda x: x + shift.to(x))  # noqa: E731
+    yield "requires grad", lambda: with_argument(lambda x: x.detach().clone().requires_grad_())
+    yield "dual", dual
+    for how in (grad, jacrev, jacfwd, hessian):
+        yield how.__name__, lambda how=how: how(shifted)(torch.zeros((), device="cpu"))
+    yield "vmap", lambda: vmap(shifted)(torch.zeros(2, device="cpu"))
+
+
+REFUSING = sorted({name for name, (_, thing) in THINGS.items() if not inspect.isclass(thing)} - {*ROWS, *MASKS})
+REFUSING = [name for name in REFUSING if not name.startswith(PENDING)]
+
+
+@pytest.mark.parametrize("name", REFUSING)
+@pytest.mark.filterwarnings("ignore")
+def test_all_other_functions_refuse_tensors_by_which_derivatives_are_taken(name: str, tmp_path: Path):
+    make, annotated = THINGS[name]
+    call = make()
+    arguments, missed = required(annotated, call, tmp_path), []
+    for key in (key for key, value in arguments.items() if has_numbers(value)):
+        for how, attempt in refusing(call, arguments, key):
+            try:
+                attempt()
+                missed.append(f"{key}, {how}: taken")
+            except BadArgument as error:
+                if not error.argument.startswith(key):
+                    missed.append(f"{key}, {how}: {error}")
+            except Exception as error:
+                missed.append(f"{key}, {how}: {error!r}"[:200])
+    assert not missed

@@ -1,7 +1,6 @@
 """Signed distance fields on grids, for collision checks."""
 
 import dataclasses
-from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -35,12 +34,7 @@ class SignedDistanceField(Value):
     spacing: float
     values: Float[Tensor, "x y z"]
 
-    @cached_property
-    def _last_node(self) -> Int[Tensor, "3"]:
-        """The index of the last grid node along each of the three axes."""
-        return torch.tensor(self.values.shape, device=self.values.device) - 1
-
-    @checked(gradients=True)
+    @checked
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] of the grid node nearest to each point, outside the grid of a border node."""
         flat = 0
@@ -57,8 +51,9 @@ class SignedDistanceField(Value):
         """
         _, ny, nz = self.values.shape
         position = (points - self.origin.to(points)) / self.spacing
-        inside = torch.minimum(position.clamp_min(0), self._last_node.to(points))
-        cell = torch.minimum(inside.detach().long(), self._last_node - 1)
+        last = torch.tensor([n - 1 for n in self.values.shape], device=points.device)
+        inside = torch.minimum(position.clamp_min(0), last.to(points))
+        cell = torch.minimum(inside.detach().long(), last - 1)
         fx, fy, fz = (inside - cell).unbind(-1)
         flat = (cell[..., 0] * ny + cell[..., 1]) * nz + cell[..., 2]
         table, dx, dy = self.values.reshape(-1), ny * nz, nz
@@ -70,8 +65,9 @@ class SignedDistanceField(Value):
         slope_y = torch.lerp(z[1] - z[0], z[3] - z[2], fx)
         slope = torch.stack([y[1] - y[0], slope_y, slope_z], -1) / self.spacing
         beyond = (position - inside) * self.spacing
-        away = torch.linalg.vector_norm(beyond, dim=-1)
-        outward = beyond / away.clamp_min(1e-12)[..., None]
+        outside = (beyond != 0).any(-1, keepdim=True)  # the norm of a zero vector has no second derivative
+        length = torch.linalg.vector_norm(torch.where(outside, beyond, 1.0), dim=-1, keepdim=True)
+        away, outward = torch.where(outside, length, 0.0)[..., 0], beyond / length
         gradient = torch.where(beyond != 0, 0.0, slope) + outward
         return torch.lerp(y[0], y[1], fx) + away, gradient
 

@@ -66,7 +66,7 @@ class Obstacles(Value):
         field = SignedDistanceField(occupancy.origin.double(), occupancy.spacing, outside - inside)
         return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64, device="cpu"), hard).to(device)
 
-    @checked(gradients=True)
+    @checked
     def likelihood(self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]) -> Float[Tensor, "*b"]:
         """Return for each set of s spheres [m] the largest occupancy probability of the regions that they touch."""
         met = centres.new_zeros(centres.shape[:-2])

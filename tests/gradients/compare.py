@@ -1,0 +1,47 @@
+"""Comparisons of results and derivatives, which the tests of the table of gradients share."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tests.gradients.table import ROWS, Function, outputs
+
+F64 = torch.float64
+
+
+def scalar(function: Function) -> Callable[..., Tensor]:
+    """Return a function that sums all results of a function with fixed weights."""
+
+    def total(*x: Tensor) -> Tensor:
+        found = outputs(function(*x))
+        weights = [torch.linspace(0.5, 1.5, y.numel(), dtype=y.dtype, device="cpu").view(y.shape) for y in found]
+        return sum((w * y).sum() for w, y in zip(weights, found, strict=True))
+
+    return total
+
+
+def near(found: Any, expected: Any, tolerance: float = 1e-7) -> None:
+    torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance)
+
+
+def every(x: tuple[Tensor, ...]) -> tuple[int, ...]:
+    return tuple(range(len(x)))
+
+
+def slopes(function: Function, x: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Return the derivatives of the sum of all results, by `backward`."""
+    leaves = tuple(v.detach().clone().requires_grad_() for v in x)
+    return torch.autograd.grad(scalar(function)(*leaves), leaves)
+
+
+def compile_rows(names: list[str]) -> None:
+    """Compare rows with themselves behind `torch.compile`; print the names of those that agree."""
+    for name in names:
+        torch.compiler.reset()
+        function, x = ROWS[name].make(F64)
+        compiled = torch.compile(lambda *v: outputs(function(*v)), backend="eager")  # noqa: B023
+        near(compiled(*x), outputs(function(*x)))
+        near(slopes(compiled, x), slopes(function, x))
+        print(name)
