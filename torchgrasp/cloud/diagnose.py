@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
-from torchgrasp.cloud.check import remove_duplicates
+from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, is_flat, nearest
 from torchgrasp.cloud.prepare import MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
 from torchgrasp.cloud.viewpoint import guess_viewpoint
@@ -162,6 +162,11 @@ def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
         (longest > 0.4, f"a length of {longest:.2f} m, large for a hand, as of a whole scene", f"one object: {cut}"),
         (report.points > 2 * MAX_POINTS, many, f"as many: {thin}"),
         (outliers > 0.05, f"{outliers:.0%} of the points far from the others", f"none: {thin}"),
+        (
+            report.points - report.copies < FEW_POINTS,
+            f"fewer than {FEW_POINTS} points, too few for a shape",
+            "a denser cloud",
+        ),
         (report.spacing > 0.1 * longest, sparse, "a denser cloud"),
         (report.noise > 0.003, f"{1e3 * report.noise:.1f} mm of noise, which blur the normals", "a nearer camera"),
         (flat, "points all in one plane, so that the thickness is a guess", "a view of two sides"),

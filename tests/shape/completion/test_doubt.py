@@ -16,6 +16,7 @@ import trimesh
 from tests.make import real
 from torchgrasp import cloud_from_depth, fit_shape
 from torchgrasp.cloud import look_at, partial_view
+from torchgrasp.cloud.diagnose import diagnose_cloud
 from torchgrasp.errors import CutOff, FewPoints, Flat, Gap, TwoBodies
 
 PATH = {"PYTHONPATH": str(Path(__file__).parents[3])}
@@ -114,8 +115,10 @@ def test_one_face_is_told_to_be_flat_and_two_faces_are_not(noise):
 
 
 def test_a_cloud_of_few_points_is_told():
+    few = partial_view(CAN, look_at(0.0, 20.0, target=CAN), n=99)
+    assert any("too few for a shape" in str(text) for text in diagnose_cloud(few).advice)
     with pytest.warns(FewPoints, match="^99 points"):
-        fit_shape(partial_view(CAN, look_at(0.0, 20.0, target=CAN), n=99), table=0.0)
+        fit_shape(few, table=0.0)
 
 
 def test_a_warning_names_the_line_of_the_caller(tmp_path):
