@@ -114,7 +114,7 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
         words = (text or "").split()
         right = len(words) == count and all(NUMBER.fullmatch(w) and math.isfinite(float(w)) for w in words)
         if right:
-            clean.set(key, " ".join(words))
+            clean.set(key, " ".join("0" if float(w) == 0 else w for w in words))  # no negative zero
         elif text != "" or key in element.attrib:
             found = f"{where} {key} {(text or 'nothing')[:80]!r}"
             raise HandFileError(

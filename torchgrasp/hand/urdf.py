@@ -179,8 +179,8 @@ def _place(origin: Any, element: ET.Element | None) -> tuple[Triple, Triple]:
     """Return translation [m] and fixed-axis angles [rad]; yourdfpy keeps a matrix, so the XML gives the angles."""
     if origin is None or element is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    (x, y, z), (roll, pitch, yaw) = origin[:3, 3] + 0.0, map(float, element.attrib["rpy"].split())  # no negative zero
-    return (float(x), float(y), float(z)), (roll + 0.0, pitch + 0.0, yaw + 0.0)
+    (x, y, z), (roll, pitch, yaw) = origin[:3, 3].tolist(), map(float, element.attrib["rpy"].split())
+    return (x, y, z), (roll, pitch, yaw)
 
 
 def _link(link: "yourdfpy.Link", element: ET.Element) -> Link:
@@ -190,15 +190,14 @@ def _link(link: "yourdfpy.Link", element: ET.Element) -> Link:
     if body is None:
         return Link(link.name, 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
     com, rpy = _place(body.origin, element.find("inertial/origin"))
-    turned = body.origin[:3, :3] @ body.inertia @ body.origin[:3, :3].T if any(rpy) else body.inertia + 0.0
-    return Link(
-        link.name, body.mass + 0.0, com, tuple(turned[([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])].tolist()), shapes
-    )
+    turn, inertia = body.origin[:3, :3] if any(rpy) else np.eye(3), body.inertia
+    turned = (turn @ inertia @ turn.T)[np.triu_indices(3)].tolist()
+    return Link(link.name, body.mass, com, tuple(turned), shapes)
 
 
 def _shape(collision: "yourdfpy.Collision", element: ET.Element) -> Shape:
     kind, shape = next((kind, shape) for kind, shape in vars(collision.geometry).items() if shape is not None)
-    size = [float(x) + 0.0 for key in SIZES[kind] for x in np.atleast_1d(getattr(shape, key))]
+    size = [float(x) for key in SIZES[kind] for x in np.atleast_1d(getattr(shape, key))]
     return Shape(kind, tuple(size), *_place(collision.origin, element.find("origin")), getattr(shape, "filename", ""))
 
 
