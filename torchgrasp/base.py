@@ -1,6 +1,7 @@
 """The base classes of all values: frozen dataclasses of tensors, and batches of them."""
 
 import dataclasses
+import functools
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -8,12 +9,14 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
+from torch._C import _functorch as functorch  # pyright: ignore[reportAttributeAccessIssue]
 
 from torchgrasp.checks import Range, check_moved, read_number, show
 from torchgrasp.errors import BadArgument, FailedRows, Status
 
 FINGERTIPS = (3, 5)  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
 
+Kept = TypeVar("Kept")
 SomeValue = TypeVar("SomeValue", bound="Value")
 SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
@@ -40,6 +43,17 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
     new = object.__new__(kind)  # checked fields need no second check, and loops make thousands of values
     new.__dict__.update(fields)
     return new
+
+
+class kept(functools.cached_property[Kept]):
+    """A cached property of tensors. Inside a transform of torch.func it keeps none: they would mean nothing later."""
+
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
+        """Return the value of the property."""
+        value = super().__get__(instance, owner)
+        if instance is not None and functorch.peek_interpreter_stack() is not None:
+            vars(instance).pop(self.attrname, None)
+        return value
 
 
 class Value:

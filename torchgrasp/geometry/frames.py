@@ -6,6 +6,7 @@ A transform `a_from_b` maps coordinates of frame b into frame a. Products theref
 
 import itertools
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -55,6 +56,11 @@ def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     return identity + torch.sinc(angle / math.pi) * turn + half * half / 2 * (turn @ turn)
 
 
+def real(numbers: Any) -> Tensor:
+    """Return numbers as a float64 tensor on the CPU, whatever torch's default dtype and device are."""
+    return torch.tensor(numbers, dtype=torch.float64, device="cpu")
+
+
 def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
     """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad]."""
     (cr, cp, cy), (sr, sp, sy) = [math.cos(a) for a in rpy], [math.sin(a) for a in rpy]
@@ -63,7 +69,7 @@ def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
         [-sp, cp * sr, cp * cr],
     ]
-    return torch.tensor(rows, dtype=torch.float64, device="cpu")
+    return real(rows)
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:

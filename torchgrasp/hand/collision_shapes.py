@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value, check_whole
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.frames import rotation_from_rpy
+from torchgrasp.geometry.frames import real, rotation_from_rpy
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import SelfCollision
@@ -64,8 +64,9 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
             centers, radius = _cover(shape, cell, 0.0 if touching else bulge)
             rows += [(index, center, radius, finger, touching) for center in centers]
     link_index, center, radius, finger, touching = zip(*rows, strict=True)
-    center, radius = torch.tensor(center, dtype=torch.float64), torch.tensor(radius, dtype=torch.float64)
-    return CollisionSpheres(torch.tensor(link_index), center, radius, torch.tensor(finger), torch.tensor(touching))
+    center, radius = real(center), real(radius)
+    link_index, finger, touching = (torch.tensor(x, device="cpu") for x in (link_index, finger, touching))
+    return CollisionSpheres(link_index, center, radius, finger, touching)
 
 
 def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
@@ -91,8 +92,7 @@ def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float
             if out > rim:
                 center[:2] = [center[0] * rim / out, center[1] * rim / out]
         centers.append(center)
-    rotated = torch.tensor(centers, dtype=torch.float64) @ rotation_from_rpy(shape.rpy).T
-    placed = rotated + torch.tensor(shape.xyz, dtype=torch.float64)
+    placed = real(centers) @ rotation_from_rpy(shape.rpy).T + real(shape.xyz)
     return [(x, y, z) for x, y, z in placed.tolist()], radius
 
 
@@ -114,12 +114,14 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
         spheres = radius[one] > 0, radius[two] > 0
         kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
     return SelfCollision(
-        link=torch.tensor(link),
+        link=torch.tensor(link, device="cpu"),
         rotation=torch.stack(rotation, -1),
-        center=torch.tensor(center, dtype=torch.float64),
-        half=torch.tensor(half, dtype=torch.float64),
-        radius=torch.tensor(radius, dtype=torch.float64),
-        pairs=torch.tensor([pair for kind in kinds for pair in kind], dtype=torch.long).reshape(-1, 2),
+        center=real(center),
+        half=real(half),
+        radius=real(radius),
+        pairs=torch.tensor([x for kind in kinds for pair in kind for x in pair], dtype=torch.long, device="cpu").view(
+            -1, 2
+        ),
         kinds=(len(kinds[0]), len(kinds[1]), len(kinds[2])),
     )
 
@@ -150,7 +152,7 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
     if not len(shapes.pairs):
         return []
     links, owner = torch.unique(shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True)
-    met, near = torch.zeros(2, len(links))
+    met, near = torch.zeros(2, len(links), dtype=torch.float64, device=links.device)
     done = 0
     for look in draw_postures(urdf, coupling, n, seed).split(1000, 1):
         if not len(owner):

@@ -1,7 +1,6 @@
 """The grasping fingers of a hand: actuated joints with the joints coupled to them, and fingertips with their pads."""
 
 import dataclasses
-import functools
 import math
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,9 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, check_device
-from torchgrasp.checks import ANY, checked
+from torchgrasp.base import Value, check_device, kept
+from torchgrasp.checks import ANY, checked, is_known
 from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import real
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_chain
 from torchgrasp.hand.urdf import Mimic, Urdf
@@ -76,8 +76,11 @@ class ActuatedJoints(Value):
         self._refuse(name, joints, (joints < low) | (joints > high), None)
 
     def _refuse(self, name: str, joints: Tensor, wrong: Tensor, allowed: str | None) -> None:
-        """Raise `BadArgument` for the first joint marked as `wrong`. It names `allowed`, or else the joint's range."""
-        if bool(wrong.any()):
+        """Raise `BadArgument` for the first joint marked as `wrong`. It names `allowed`, or else the joint's range.
+
+        Inside torch.vmap and torch.compile the numbers are not known, and not tested.
+        """
+        if not torch.compiler.is_compiling() and is_known(joints) and bool(wrong.any()):
             *batch, k = torch.nonzero(wrong)[0].tolist()
             limits = f"a number in [{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"
             raise BadArgument(name, f"{joints[(*batch, k)].item():.6g} for {self.names[k]}", allowed or limits)
@@ -89,14 +92,12 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     own = [j for f in spec.fingers for j in f.joints]
     leaders = [spec.coupling[j].source for j in own if j in spec.coupling]
     names = tuple(dict.fromkeys([*(j for j in own if j not in spec.coupling), *leaders]))
-    limits = torch.tensor([[movable[n].lower, movable[n].upper] for n in names], dtype=torch.float64)
-    limits = limits + torch.tensor([spec.limit_margin, -spec.limit_margin], dtype=torch.float64)
+    limits = real([[movable[n].lower, movable[n].upper] for n in names]) + real([spec.limit_margin, -spec.limit_margin])
     for name, (low, high) in zip(names, limits.tolist(), strict=True):
         if not low < high:
             found = f"limit_margin {spec.limit_margin:g}, which leaves [{low:g}, {high:g}] to joint {name}"
             raise spec.wrong(found, "a range with lower < upper")
-    coupling = torch.zeros(len(movable), len(names), dtype=torch.float64)
-    offset = torch.zeros(len(movable), dtype=torch.float64)
+    coupling, offset = limits.new_zeros(len(movable), len(names)), limits.new_zeros(len(movable))
     for row, joint in enumerate(movable):
         source, ratio, shift = spec.coupling.get(joint, Mimic(joint, 1.0, 0.0))
         if source in names:
@@ -141,9 +142,9 @@ class Fingertips(Value):
     @property
     def cone(self) -> Float[Tensor, "f"]:
         """The half angle [rad] of each pad's cone: the tip may touch only within this angle of the pad's axis."""
-        return torch.where(self.radius > 0, ROUND_PAD, FLAT_PAD).to(self.radius)
+        return torch.where(self.radius > 0, *self.radius.new_tensor([ROUND_PAD, FLAT_PAD]))
 
-    @functools.cached_property
+    @kept
     def in_carriers(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
         """Contact points [m], unit normals and centres [m] of the pads, each in the frame of the tip's carrier link."""
         pose = self.carrier_from_tip
@@ -163,11 +164,11 @@ def tips_from_files(spec: HandSpec, urdf: Urdf, chain: "Chain") -> Fingertips:
     """Return the fingertips of the grasping fingers, as hand.toml and the URDF's chain describe them."""
     links, tips = [x.name for x in urdf.links], tuple(f.tip_link for f in spec.fingers)
     pads = zip(*(f.pad for f in spec.fingers), strict=True)
-    contact, normal, center, radius = (torch.tensor(x, dtype=torch.float64) for x in pads)
+    contact, normal, center, radius = map(real, pads)
     carriers, poses = zip(*(pose_in_carrier(chain, tip) for tip in tips), strict=True)
     chains = tree_from_chain(chain, urdf, carriers)
-    carrier = torch.tensor([chains.link_names.index(name) for name in carriers])
-    index = torch.tensor([links.index(tip) for tip in tips])
+    carrier = torch.tensor([chains.link_names.index(name) for name in carriers], device="cpu")
+    index = torch.tensor([links.index(tip) for tip in tips], device="cpu")
     names = tuple(f.name for f in spec.fingers)
     poses = torch.stack(poses, -1)[..., None]
     return Fingertips(names, tips, index, contact, normal, center, radius, chains, carrier, poses)

@@ -5,22 +5,33 @@ import dataclasses
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, kept
 from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
-from torchgrasp.hand.kinematics import FreeMotion, KinematicTree, map_directions, map_points
+from torchgrasp.hand.kinematics import (
+    FreeMotion,
+    KinematicTree,
+    chain_jacobian,
+    chain_poses,
+    map_directions,
+    map_points,
+    serial_chains,
+)  # fmt: skip
 from torchgrasp.hand.self_collision import SelfCollision
 
 if TYPE_CHECKING:
-    from pytorch_kinematics import Chain
+    from pytorch_kinematics import Chain, SerialChain
+
+Backend = Literal["torchgrasp", "pytorch_kinematics"]
+"""What computes forward kinematics: compiled tables, or the library of the hand's chain."""
 
 
 class Actuator(NamedTuple):
@@ -102,6 +113,11 @@ class Hand(Value):
         return dataclasses.replace(moved, chain=chain)
 
     @functools.cached_property
+    def finger_chains(self) -> tuple["SerialChain", ...]:
+        """The part of `chain` from the palm to each fingertip's link."""
+        return serial_chains(self.chain, self.tips.links)
+
+    @kept
     def motion(self) -> FreeMotion:
         """Tables of how links, collision spheres, tip centres and pads move with the hand's pose and its joints."""
         spheres, tips = self.collision_spheres, self.tips
@@ -181,11 +197,20 @@ class Hand(Value):
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
 
     @checked(gradients=True)
-    def fingertips(self, joints: Float[Tensor, "*b h"]) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return the contact points [m] and outward unit normals of the fingertip pads, in the palm's frame."""
-        _, carriers = self.tips.frames(self._columns(joints))
-        contact, normal, _ = self.tips.in_carriers
-        return _rows(map_points(carriers, contact), joints), _rows(map_directions(carriers, normal), joints)
+    def fingertips(
+        self, joints: Float[Tensor, "*b h"], backend: Backend = "torchgrasp"
+    ) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
+        """Return the contact points [m] and outward unit normals of the fingertip pads, in the palm's frame.
+
+        With `backend="pytorch_kinematics"` the hand's chain itself computes the poses of the fingertips.
+        """
+        if backend == "torchgrasp":
+            (_, frames), (contact, normal, _) = self.tips.frames(self._columns(joints)), self.tips.in_carriers
+        else:
+            poses = chain_poses(self.chain, self.tree.joint_names, self._columns(joints))
+            frames = poses[[self.chain.frame_to_idx[link] for link in self.tips.links], :, :3].permute(2, 3, 0, 1)
+            frames, contact, normal = frames.to(joints), self.tips.contact, self.tips.normal
+        return _rows(map_points(frames, contact), joints), _rows(map_directions(frames, normal), joints)
 
     @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
@@ -195,12 +220,23 @@ class Hand(Value):
 
     @checked(gradients=True)
     def jacobian(
-        self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
+        self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None, backend: Backend = "torchgrasp"
     ) -> Float[Tensor, "*b f 3 h"]:
         """Return the Jacobian [m/rad] of the fingertips' contact points with respect to the actuated joints.
 
         `at` are points [m] fixed to the fingertips, such as where round tips touch; by default the contact points.
+        With `backend="pytorch_kinematics"` the chain of each finger itself computes the Jacobian.
         """
+        if backend == "pytorch_kinematics":
+            points = self.fingertips(joints, backend)[0] if at is None else at
+            columns, names = self._columns(joints), self.tree.joint_names
+            moved = [
+                chain_jacobian(chain, names, columns, point, self.actuated.coupling)
+                for chain, point in zip(
+                    self.finger_chains, points.reshape(-1, len(self.tips), 3).unbind(1), strict=True
+                )
+            ]
+            return torch.stack(moved, 1).reshape(*points.shape, self.dof)
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
         if at is None:
@@ -263,4 +299,4 @@ class Hand(Value):
 
 def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
     """Return a tensor with reversed axes, so that postures come first, in the batch shape of `joints`."""
-    return columns.permute(*range(columns.ndim - 1, -1, -1)).reshape(*joints.shape[:-1], *columns.shape[-2::-1])
+    return columns.permute(tuple(range(columns.ndim))[::-1]).reshape(*joints.shape[:-1], *columns.shape[-2::-1])

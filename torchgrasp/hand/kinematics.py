@@ -4,6 +4,7 @@ The pose of a child link in its parent is `constant + sine sin q + cosine cos q 
 the joint between them. The four tables are computed once.
 """
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Collection, Sequence
@@ -14,12 +15,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.checks import checked
-from torchgrasp.geometry.frames import rigid, rotation_from_rpy, skew
+from torchgrasp.checks import checked, is_known
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy, skew
 from torchgrasp.hand.urdf import Urdf
 
 if TYPE_CHECKING:
-    from pytorch_kinematics import Chain
+    from pytorch_kinematics import Chain, SerialChain
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -129,7 +131,8 @@ class FreeMotion(Value):
     ) -> "FreeMotion":
         """Return the tables for groups of markers: link indices, coordinates, and 1 for points or 0 for directions."""
         own = torch.nonzero((coupling != 0).any(1))[:, 0]
-        axes, slides = torch.eye(3).to(tree.axis), tree.prismatic[own]
+        eye = functools.partial(torch.eye, dtype=tree.axis.dtype, device=tree.axis.device)
+        axes, slides = eye(3), tree.prismatic[own]
         root = torch.nonzero(tree.places == 0)[:, 0].expand(6)
         link = torch.cat([root, tree.child[own]])
         turning = torch.cat([0 * axes, axes, tree.axis[own] * (1 - slides[:, None])])
@@ -140,8 +143,8 @@ class FreeMotion(Value):
         product = axes.new_zeros(len(at), 4, len(tree.link_names))
         product[torch.arange(len(at), device=at.device), :, at] = torch.cat(local)
         moves = torch.cat([axes.new_ones(len(tree.moves), 6), tree.moves[:, own]], 1)
-        whole = torch.block_diag(torch.eye(6).to(axes), coupling[own])
-        same = whole.shape[0] == whole.shape[1] and torch.equal(whole, torch.eye(len(whole)).to(whole))
+        whole = torch.block_diag(eye(6), coupling[own])
+        same = whole.shape[0] == whole.shape[1] and torch.equal(whole, eye(len(whole)))
         return cls(product.flatten(1), tuple(len(x) for x in local), moves, None if same else whole)
 
     def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
@@ -171,7 +174,7 @@ def chain_from_urdf(urdf: Urdf) -> "Chain":
     with torch.device("cpu"):  # the library makes some tensors on torch's default device
         frames = {urdf.root: frame.Frame(urdf.root, frame.Link(urdf.root), frame.Joint(dtype=torch.float64))}
         for j in urdf.joints:
-            place = rigid(rotation_from_rpy(j.rpy), torch.tensor(j.xyz, dtype=torch.float64))
+            place = rigid(rotation_from_rpy(j.rpy), real(j.xyz))
             ranges = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
             kind = "revolute" if j.kind == "continuous" else j.kind
             offset = transforms.Transform3d(matrix=place)
@@ -208,7 +211,7 @@ def tree_from_chain(chain: "Chain", urdf: Urdf, ends: Collection[str] | None = N
         child=new([at.index(k) if k in part else 0 for k in frames], dtype=torch.long),
         axis=chain.axes[joints],
         prismatic=slides[frames].to(chain.axes),
-        moves=new([[float(k in paths[link]) for k in frames] for link in at], dtype=torch.float64),
+        moves=real([[float(k in paths[link]) for k in frames] for link in at]),
         tables=torch.stack([_tables(chain, k) for k in order], -1)[..., None],
         joint=new([joints.index(own[k]) if own[k] >= 0 else 0 for k in order]),
         parent=new([levels[d - 1].index(paths[k][-2]) if d else 0 for d, level in enumerate(levels) for k in level]),
@@ -216,6 +219,38 @@ def tree_from_chain(chain: "Chain", urdf: Urdf, ends: Collection[str] | None = N
         places=new([order.index(k) for k in at]),
         slides=bool(slides[at].any()),
     )
+
+
+def chain_poses(chain: "Chain", names: Sequence[str], values: Float[Tensor, "j n"]) -> Float[Tensor, "c n 4 4"]:
+    """Return the poses of a chain's frames by pytorch-kinematics, given the positions of all joints by `names`."""
+    if not (torch.compiler.is_compiling() or is_known(values)):
+        raise BadArgument("backend", "pytorch_kinematics inside torch.vmap", "torchgrasp: the other writes in place")
+    columns = [names.index(name) for name in chain.get_joint_parameter_names()]
+    # the library's analytical gradient has no second derivatives
+    return chain.forward_kinematics_tensor(values[columns].T.to(chain.dtype), analytical_grad=False)
+
+
+def chain_jacobian(
+    chain: "SerialChain", names: Sequence[str], values: Tensor, points: Float[Tensor, "n 3"], coupling: Tensor
+) -> Float[Tensor, "n 3 h"]:
+    """Return the Jacobian of points fixed to a chain's last link by pytorch-kinematics; `coupling` is (j, h)."""
+    poses = chain_poses(chain, names, values)
+    arm = points.to(poses) - poses[-1, :, :3, 3]
+    twist: Any = chain.jacobian_tensor(values, all_transforms=poses)
+    moved = twist[:, :3] + torch.linalg.cross(twist[:, 3:], arm[:, :, None].expand_as(twist[:, 3:]), dim=1)
+    rows = [names.index(name) for name in chain.get_joint_parameter_names()]
+    return moved.to(values) @ coupling[rows].to(values)
+
+
+def serial_chains(chain: "Chain", links: Sequence[str]) -> tuple["SerialChain", ...]:
+    """Return the parts of a chain from its root to some links, made on the CPU and moved to the chain's device."""
+    from pytorch_kinematics import SerialChain
+    from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack as outside_transforms
+
+    with torch.device("cpu"), outside_transforms():
+        whole = copy.deepcopy(chain).to(device="cpu")
+        parts = [SerialChain(whole, link, dtype=chain.dtype) for link in links]
+    return tuple(part.to(device=chain.device) for part in parts)
 
 
 def pose_in_carrier(chain: "Chain", link: str) -> tuple[str, Float[Tensor, "3 4"]]:

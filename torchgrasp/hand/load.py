@@ -3,10 +3,9 @@
 import hashlib
 from pathlib import Path
 
-import torch
-
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.geometry.frames import real
 from torchgrasp.hand.collision_shapes import self_collision_from_urdf, spheres_from_urdf
 from torchgrasp.hand.fingers import joints_from_files, tips_from_files
 from torchgrasp.hand.hand import Actuator, Hand, HandSource
@@ -83,7 +82,7 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
         chain=chain,
         tree=tree_from_chain(chain, urdf),
         tips=tips_from_files(spec, urdf, chain),
-        approach=torch.tensor(spec.approach, dtype=torch.float64),
+        approach=real(spec.approach),
         actuators={j.name: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for j in urdf.movable},
         collision_spheres=spheres_from_urdf(urdf, spec),
         self_collision=self_collision_from_urdf(urdf, spec.pairs),

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Range, checked
+from torchgrasp.base import Value, kept
+from torchgrasp.checks import Range, checked, is_known
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.kinematics import map_points
 
@@ -57,8 +57,13 @@ class SelfCollision(Value):
             distance = self._distances(shapes[1])
             inscribed = self.half.amin(1) + self.radius
             limit = (distance - self._sums(inscribed, distance)).amin(0).clamp_max(below)
-            pair, row = torch.nonzero(distance - self._sums(self._bounding, distance) <= limit, as_tuple=True)
-        return least.scatter_reduce(0, row, self._separations(shapes, pair, row), "amin")
+            near = distance - self._sums(self._bounding, distance) <= limit
+            dense = not torch.compiler.is_compiling() and not is_known(near)  # torch.vmap cannot select entries
+            every = torch.ones(near.shape, dtype=torch.bool, device=near.device) if dense else near
+            pair, row = torch.nonzero(every, as_tuple=True)
+        apart = self._separations(shapes, pair, row)
+        apart = torch.where(near[pair, row], apart, torch.inf) if dense else apart
+        return least.scatter_reduce(0, row, apart, "amin")
 
     @checked(gradients=True)
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
@@ -118,6 +123,8 @@ class SelfCollision(Value):
 
         The index vectors hold the pair and the posture of each separation that is less than `below`.
         """
+        if not torch.compiler.is_compiling() and not is_known(frames):
+            raise BadArgument("frames", "a tensor inside torch.vmap", "a plain batch; `clearance` takes both")
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding, distance)
@@ -134,7 +141,7 @@ class SelfCollision(Value):
         """The number of link frames to pass, so that every link with a collision shape is among them."""
         return int(self.link.max()) + 1 if len(self.link) else 0
 
-    @cached_property
+    @kept
     def _bounding(self) -> Float[Tensor, " s"]:
         """The radius [m] of the bounding sphere of each collision shape."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
@@ -168,7 +175,8 @@ class SelfCollision(Value):
                 local, axes = _inside(two[:, :, at], gap[:, at]), two[:, :, at]
                 out = local.abs() - half[:, second[at]]
                 inside = (torch.arange(3, device=out.device)[:, None] == out.argmax(0)).to(out)
-                slope = torch.where((out > 0).any(0), out.clamp_min(0), inside) * torch.where(local < 0, -1.0, 1.0)
+                slope = torch.where((out > 0).any(0), out.clamp_min(0), inside)
+                slope = torch.where(local < 0, -slope, slope)
                 # any turn about the sphere's centre is free
                 return (axes * (slope / _length(slope))).sum(1), place[:, at] - gap[:, at]
 
@@ -249,7 +257,8 @@ class BoxPairs(NamedTuple):
         j = torch.where(edges, (best - 6) % 3, (best - 3).clamp(0, 2))
         along_a, along_b = (x.gather(1, at.expand(3, 1, -1))[:, 0] for x, at in ((a, i), (b, j)))
         push = torch.where(edges, torch.linalg.cross(along_a, along_b, dim=0), torch.where(best < 3, along_a, along_b))
-        push = push / _length(push) * torch.where((push * gap).sum(0) < 0, -1.0, 1.0)
+        push = push / _length(push)
+        push = torch.where((push * gap).sum(0) < 0, -push, push)
         reach_a, reach_b = _inside(a, push).sign() * half_a, _inside(b, push).sign() * half_b
         reach_a = reach_a.scatter(0, i, torch.where(edges, 0.0, reach_a.gather(0, i)))  # anywhere along an edge
         reach_b = reach_b.scatter(0, j, torch.where(edges, 0.0, reach_b.gather(0, j)))
