@@ -145,8 +145,8 @@ class TrialSpec(Value):
 
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
-            "uncertainty": the same control law with further components (`ClosingOptions`). "fixed": "uncertainty" with
-            equal gains. "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
+            "uncertainty": such a law with the calibrated deviation and components (`ClosingOptions`). "fixed": the same
+            with equal gains. "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
             "position": PI control to goals behind the contacts. "open_loop": joint motion from pre-grasp to grasp to
             squeeze.
         holding: how the closed hand presses: "force" (balanced forces), "grip" (least forces for the felt load),

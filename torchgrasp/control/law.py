@@ -62,7 +62,7 @@ def _normal_covariance(normals: Float[Tensor, "*b 3"], std: Float[Tensor, "*b"],
 
 
 def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return each finger's share of force control, from 0 to 1 (lambda in Eq. 26 of the paper).
+    """Return each finger's share of force control, from 0 to 1: lambda = exp(-e^T Sigma_cov^-1 e / 2), Eq. (26).
 
     It is 1 at the contact, and near 0 where the position error [m] exceeds the shape's uncertainty.
     """

@@ -1,4 +1,4 @@
-"""The default closing: the paper's control law (Eqs. 25-28), extended where the object is not where it was seen."""
+"""The default closing: a control law like the paper's, extended where the object is not where it was seen."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ LEAD = 0.04
 
 
 class UncertaintyClosing:
-    """The default closing controller: the paper's control law (Eqs. 25-28) with extensions.
+    """The default closing controller: Eqs. (25), (26) and (28) of the paper with `surface_covariance` and extensions.
 
     * A finger that does not touch searches along the normal of its planned contact, even beyond the contact, but not
       below the table. A finger that touches is force-controlled, whatever its position error.

@@ -26,8 +26,9 @@ GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the 
 
 
 class PaperClosing:
-    """The paper's control law (Eqs. 25-28), with a damped inverse of the Jacobian and limits of gain and speed.
+    """The paper's control law, d theta = J^-1 [(1 - lambda) K_P (x_d - x_c) + lambda C_F (f_d - f_c)], Eqs. (25)-(28).
 
+    The gains are those of `ClosingReference.as_printed`. A damped inverse replaces J^-1; speed is bounded.
     No joint target is so far ahead of its joint that the drive would exceed its torque limit. The closing ends when
     all fingers touch, the share of force control (lambda, Eq. 26) is at least 0.5 in each, and the forces have been
     steady for `SETTLED` seconds.
