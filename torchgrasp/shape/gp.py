@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, in_chunks
+from torchgrasp.base import Value
 from torchgrasp.checks import Pose, Positive, Range, Seed, check_moved, check_tensor, checked, is_known
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply
@@ -33,8 +33,8 @@ MAX_JOINT = 1000  # most points of one joint posterior: its memory grows with th
 class ShapeGP(Posterior, Normalisation):
     """The posterior of an object's signed distance function, Eq. (1) of the paper, given observations; see `fit_shape`.
 
-    All methods are differentiable in the points to any order, except `update`, which refuses points that require a
-    gradient.
+    All methods but `update` are differentiable in the points to any order, and twice at observed points, where the thin
+    plate's normals have one derivative only. `update` refuses points that require a gradient.
 
     Args:
         psi: the kernel's length psi, normalised.
@@ -121,17 +121,19 @@ class ShapeGP(Posterior, Normalisation):
         >>> fit_shape(view).differentiate(view.points[:4]).normal.shape
         torch.Size([4, 3, 3])
         """
-
-        def total(points: Tensor) -> tuple[Tensor, ...]:
-            found = self.predict(points)
-            return found.distance.sum(), found.normal.sum(0), found.variance.sum(), found.std_m.sum()
-
-        def slopes(points: Tensor) -> tuple[Tensor, ...]:
-            distance, normal, variance, std_m = torch.func.jacrev(total)(points)
-            return distance, normal.transpose(0, 1), variance, std_m
-
-        found = in_chunks(slopes, points.reshape(-1, 3), 256)
-        return ShapeDerivatives(*(_reshape(part, points) for part in found))
+        jet = self.jet(self._queries(points))
+        length = torch.linalg.vector_norm(jet.gradient, dim=-1)[:, None, None]
+        normal = jet.gradient[:, :, None] / length
+        steeper = normal.transpose(1, 2) @ jet.hessian  # the derivative of the slope
+        along = normal @ steeper
+        std = surface_deviation(jet.variance, jet.gradient)[:, None]
+        relative = jet.variance_gradient / (2 * jet.variance[:, None]) - steeper[:, 0] / length[:, 0]
+        return ShapeDerivatives(
+            distance=_reshape(jet.gradient / self.scale, points),
+            normal=_reshape((jet.hessian - along) / (length * self.scale), points),
+            variance=_reshape(jet.variance_gradient / self.scale, points),
+            std_m=_reshape(self.std_factor * std * relative, points),
+        )
 
     @checked(gradients=True)
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:

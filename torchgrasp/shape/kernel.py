@@ -65,8 +65,8 @@ def is_plain(*tensors: Tensor) -> bool:
 def differentiate(profile: Profile, u: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
     """Return k and its derivatives by u = r^2 / 2, by autograd, `count` in all, at most 4.
 
-    They are differentiable by u to any order. A derivative that is infinite at r = 0 counts as 0 there: covariances
-    multiply it by a power of r.
+    They are differentiable by u to any order, but at r = 0 only those up to (d/du)^2 k are right. Higher ones, and
+    infinite ones, count as 0 there: covariances and their second derivatives multiply them by a power of r.
     """
     near = u < NEAR_ZERO**2 / 2
     r = torch.sqrt(2.0 * torch.where(near, NEAR_ZERO**2 / 2, u))
@@ -134,7 +134,7 @@ def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor
         values.append(6.0 * inverse)
         if count > 3:
             values.append((inverse * inverse).mul_(inverse).mul_(-6.0))
-    return tuple(values)
+    return tuple(values[:count])
 
 
 @checked
@@ -144,12 +144,19 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
     """
+    scale = math.sqrt(5.0) / length
 
     def profile(r: Tensor) -> Tensor:
-        s = (math.sqrt(5.0) / length) * r
+        s = scale * r
         return variance * (1.0 + s + s * s / 3.0) * torch.exp(-s)
 
-    return Kernel(profile)
+    def closed_form(r: Tensor, count: int) -> tuple[Tensor, ...]:
+        fall = torch.exp(-scale * r) * (variance / 3.0)
+        inverse = torch.reciprocal(r).masked_fill(r == 0, 0.0)
+        orders = -(scale**2) * (1.0 + scale * r) * fall, scale**4 * fall, -(scale**5) * inverse * fall
+        return profile(r), *orders[: count - 1]
+
+    return Kernel(profile, closed_form=closed_form)
 
 
 @checked
@@ -159,7 +166,15 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
     1.0
     """
-    return Kernel(lambda r: variance * torch.exp(r * r * (-0.5 / length**2)))
+
+    def profile(r: Tensor) -> Tensor:
+        return variance * torch.exp(r * r * (-0.5 / length**2))
+
+    def closed_form(r: Tensor, count: int) -> tuple[Tensor, ...]:
+        k = profile(r)
+        return tuple(k * (-1.0 / length**2) ** order for order in range(count))
+
+    return Kernel(profile, closed_form=closed_form)
 
 
 @checked

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.base import Value, in_chunks
 from torchgrasp.checks import checked, is_known
 from torchgrasp.errors import IndefiniteCovariance
-from torchgrasp.shape.kernel import Kernel, cross_covariance, gram, is_plain, separations
+from torchgrasp.shape.kernel import Kernel, cross_covariance, differentiate, gram, is_plain, separations
 from torchgrasp.shape.values import JointEstimate, MeanJet, SurfaceJet
 
 
@@ -159,7 +159,9 @@ class Posterior(Value):
     def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
         """Return the covariance of the distances at normalised points with all observations, one row per point."""
         if not self.is_plain(x):
-            return self.cross(x)[0]
+            d = x[:, None] - self.x
+            k, first = differentiate(self.kernel.profile, (d * d).sum(-1) / 2, 2)
+            return torch.cat([k, -(first[..., None] * d)[:, : self.n_oriented].mT.flatten(1)], 1)
         d, r = separations(x, self.x)
         k, first = self.kernel.derivatives(r, 2)
         return _distance_rows(d, k, first, self.n_oriented)
