@@ -1,0 +1,58 @@
+"""Gradients: fit the posture model by descent instead of EM, and move fingertips onto an uncertain shape by descent."""
+
+import torch
+
+from torchgrasp import GraspMixture, encode, fit_shape, load_hand, load_mixture, load_object, plan_grasps
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.posture_model import fit_mixture, sample_configurations
+
+hand = load_hand("barrett")
+
+# 1. The leaves are the parameters of four Gaussians in units of the samples' deviations.
+samples = sample_configurations(hand, 3000)
+rows, em = samples.rows(), fit_mixture(samples, components=4)
+centre, unit = rows.mean(0), rows.std(0)
+logits, means, factors = torch.zeros(4), torch.randn(4, 10, generator=torch.Generator().manual_seed(0)), torch.eye(10)
+leaves = [x.double().requires_grad_() for x in (logits, means, factors.repeat(4, 1, 1))]
+optimiser = torch.optim.Adam(leaves, lr=0.05)
+for _ in range(300):
+    logits, means, factors = leaves
+    root = unit[:, None] * factors.tril()
+    covariances = root @ root.mT + torch.diag(1e-4 * unit**2)
+    loss = -GraspMixture(logits.softmax(0), centre + unit * means, covariances, em.names).log_prob(rows).mean()
+    optimiser.zero_grad()
+    loss.backward()
+    optimiser.step()
+print(f"mean log-likelihood: {float(-loss):.2f} by descent, {float(em.log_prob(rows).mean()):.2f} by EM")
+
+# 2. Forward kinematics, the shape's posterior and the posture model form one loss of the joints [rad].
+view = load_object("cylinder").view
+shape, model, grasp = fit_shape(view), load_mixture("barrett"), plan_grasps(view, hand, starts=30)[0]
+pose, joints = grasp.obj_from_hand.double(), (grasp.joints + 0.1).double()  # spoiled, so that there is something to do
+
+
+def loss_of(joints: torch.Tensor) -> torch.Tensor:
+    """Return squared distances and deviations [mm2] of the surface at the fingertips, plus the energy, Eq. (21)."""
+    points, normals = hand.fingertips(joints)
+    points, normals = apply(pose, points), rotate(pose, normals)
+    surface = shape.predict(points)
+    off = 1e3 * shape.scale * surface.distance  # [mm]
+    return (off**2 + (1e3 * surface.std_m) ** 2).sum() + model.energy(encode((points, normals))).amin()
+
+
+joints.requires_grad_()
+optimiser = torch.optim.LBFGS([joints], max_iter=25, line_search_fn="strong_wolfe")
+print(f"loss {float(loss_of(joints)):.1f} of the spoiled grasp,", end=" ")
+
+
+def evaluate() -> torch.Tensor:
+    """Return the loss, and leave its gradient in the joints."""
+    optimiser.zero_grad()
+    loss = loss_of(joints)
+    loss.backward()
+    return loss
+
+
+optimiser.step(evaluate)
+curvature = torch.func.hessian(loss_of)(joints.detach())[0, :, 0]
+print(f"{float(loss_of(joints)):.1f} after descent, with curvatures {torch.linalg.eigvalsh(curvature).numpy().round()}")
