@@ -4,6 +4,7 @@
 `torchgrasp hand train` learns the posture model of a hand.
 
 python scripts/train.py stability allegro --workers 2             which pulled grasps hold, for the impedance control
+python scripts/train.py paper_model allegro                       the posture model of mode "paper"
 python scripts/train.py success                                   the predicted success that ranks grasps
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
 python scripts/train.py bands DIR                                 how far off hidden sides are
@@ -18,13 +19,14 @@ import tyro
 from train.author_objects import golden, objects, scene
 from train.bands import bands
 from train.occupancy import occupancy
+from train.paper_model import paper_model
 from train.stability import stability
 from train.success import success
 
 from torchgrasp.errors import GraspError
 
 if __name__ == "__main__":
-    commands = {x.__name__: x for x in (stability, success, occupancy, bands, objects, scene, golden)}
+    commands = {x.__name__: x for x in (stability, paper_model, success, occupancy, bands, objects, scene, golden)}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")
     except GraspError as error:

@@ -8,7 +8,8 @@ from torchgrasp import ContactSpec, Status, load_object, plan_grasps
 from torchgrasp.geometry.frames import apply, virtual_frame
 from torchgrasp.ik.candidates import PAPER_TOLERANCE
 from torchgrasp.ik.ranking import rank_by_variance
-from torchgrasp.posture_model.mixture import PAPER_ENERGY
+from torchgrasp.posture_model.mixture import PAPER_ENERGY, load_mixture
+from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.shape.surface import extract_surface
 
 SPEC = ContactSpec.paper(table=0.0)
@@ -45,6 +46,25 @@ def test_shape_contacts_eq21_seeds_and_ranking_are_the_papers(run):
     total = good.contacts.variance.sum(1)
     assert torch.equal(total, total.sort().values)
     assert sorted(ranked.score.tolist()) == sorted(mixed.score.tolist())
+
+
+def test_every_assignment_that_eq21_accepts_is_tried_until_enough_grasps_are_executable(run):
+    _, grasps, stages = run
+    seeds = stages["query"]
+    tried = seeds[: len(grasps)]
+    assert len(tried) > len(tried.row.unique()) > 1  # several assignments of one triple
+    assert sorted(tried.permutation.tolist()) == sorted(grasps.permutation.tolist())
+    assert len(grasps) == len(seeds) or int((grasps.status == Status.OK).sum()) >= 10
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_the_model_of_mode_paper_knows_small_triples_better(name):
+    hand = load_hand(name)
+    own, other = (load_mixture(hand.urdf_path.parent / f"{file}.safetensors") for file in ("paper", "mixture"))
+    samples = sample_configurations(hand, 3000, seed=5, sampling="grasping")
+    small = samples.q[samples.q[:, :3].mean(1) < 0.045]
+    accepted = [float((model.energy(small) < PAPER_ENERGY).double().mean()) for model in (own, other)]
+    assert len(small) > 30 and accepted[0] > 1.2 * accepted[1]
 
 
 def test_eq24_contact_points_meet_the_contacts_and_the_hand_is_clear(run):

@@ -229,24 +229,13 @@ class CobylaRun:
 
 
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Find grasps as in the paper: return a checked grasp for each contact set that was tried, best grasp first.
+    """Find grasps as in the paper: return a checked grasp for each seed that was tried, best grasp first.
 
-    Contact sets are tried five at a time, with two seeds each, until 10 grasps are executable or 30 sets were tried.
+    Seeds are tried ten at a time, in the order of their contact sets, until 10 grasps are executable or 300 were tried.
     """
-    seeds = problem.drop_unreachable(seeds)
-    attempts, rows = Attempts(torch.ones_like(problem.certificate.closed), executable), seeds.row.unique()
-    for some in rows.split(5):  # one empty part without rows
-        chosen = seeds[torch.isin(seeds.row, some)]
-        attempts.refine(chosen, _rank(problem, chosen), (1, 1), partial(refine_on_contacts, problem, cobyla=True))
-        results = join(attempts.results)
-        if int(executable(results).sum()) >= 10 or len(results) >= 30:
+    seeds, tried = problem.drop_unreachable(seeds), list[Grasps]()
+    for first in range(0, max(min(len(seeds), 300), 1), 10):
+        tried.append(refine_on_contacts(problem, seeds[first : first + 10], cobyla=True))
+        if int(executable(join(tried)).sum()) >= 10:
             break
-    return best_first(best_grasps(attempts)[0])
-
-
-def _rank(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return the rank of each seed among the seeds of its contact set; rank 0 has the least deep collision."""
-    contacts, still = assign(problem.contacts, seeds), np.zeros(problem.hand.dof)
-    runs = [CobylaRun(problem.hand, q, p, problem.world) for q, p in zip(seeds.joints, contacts.points, strict=True)]
-    deepest = [max(0.0, -float(run.evaluate(still)[1].min())) for run in runs]
-    return rank_in_group(seeds.row, torch.tensor(deepest, dtype=torch.float64, device=seeds.row.device))
+    return best_first(join(tried))

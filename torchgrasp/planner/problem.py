@@ -154,7 +154,9 @@ class Problem:
         cloud = remove_duplicates(cloud)
         mixture, mixture_sha256 = None, "none"
         if request.mode != "joint":
-            path = mixture_path(request.hand.urdf_path.parent)
+            folder = request.hand.urdf_path.parent
+            own = folder / "paper.safetensors"  # of postures of all sizes alike, so that Eq. (21) knows small objects
+            path = own if request.mode == "paper" and own.is_file() else mixture_path(folder)
             mixture, mixture_sha256 = load_mixture(path), sha256(path)
         frame = upright_frame(cloud.points, cloud.viewpoint, spec.plane)
         if request.shape is None:
