@@ -11,6 +11,8 @@ from torchgrasp.values import Grasps, IKSeeds
 SPEC = ContactSpec.paper(table=0.0)
 TRIAL = TrialSpec(closing="paper", holding="impedance")
 
+TITLE = ("object", "hand", "closed", "Eq. 21", "assigned", "COBYLA", "tips", "links", "rest", "good", "held")
+
 
 def funnel(
     starts: int = 1000, seed: int = 0, hands: tuple[str, ...] = ("allegro", "barrett"), only: tuple[str, ...] = (),
@@ -19,7 +21,7 @@ def funnel(
     """Print for each object and hand how many triples, assignments and grasps are left after each stage of the paper.
 
     The columns: triples with force closure; triples and assignments that Eq. (21) accepts; assignments on which COBYLA
-    ran, and why those that failed did; executable grasps; grasps of the first few that the paper's closing lifts.
+    ran, and why those that failed did; executable grasps (good); which of the first few the paper's closing lifts.
 
     Args:
         starts: of the contact planner.
@@ -29,7 +31,7 @@ def funnel(
         lifted: grasps of each object and hand that are closed and lifted; 0 needs no simulator.
     """
     torch.set_num_threads(1)
-    lines = [("object", "hand", "closed", "Eq. 21", "assigned", "COBYLA", "tips", "links", "rest", "executable", "held")]
+    lines: list[tuple[str, ...]] = [TITLE]
     for name in only or list_objects():
         for hand in hands:
             lines.append((name, hand, *map(str, count_stages(name, hand, starts, seed, lifted))))
