@@ -63,7 +63,9 @@ def grasps(out: Path, starts: int = 1000, seed: int = 0, only: tuple[str, ...] =
     pairs = [found for both in taken for t in both if (found := unlike_pair(t)) is not None]
     widest = sorted(pairs, key=lambda pair: -pair[3])[:2]
     save([[(t, one), (t, two)] for t, one, two, _ in widest], out / "fig9.png")
-    save([found for allegro, barrett in taken if (found := shared_triple(allegro, barrett.hand))][:2], out / "fig10.png")
+    save(
+        [found for allegro, barrett in taken if (found := shared_triple(allegro, barrett.hand))][:2], out / "fig10.png"
+    )
     for k, number in ((1, 11), (0, 12)):
         shown = [(both[k], index) for both in taken for index in range(min(SHOWN, len(both[k].grasps)))]
         save([[one] for one in shown], out / f"fig{number}.png")
