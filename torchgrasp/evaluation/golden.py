@@ -18,10 +18,7 @@ from torchgrasp.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A shipped grasp of a shipped object; `held` says whether the simulated hand should hold the object.
-
-    The hand is displaced by `shift` [m] against its approach; `mass` [kg] is that of the object.
-    """
+    """A shipped grasp, its right verdict, the distance [m] of the hand from its place, and the mass [kg] of the object."""
 
     object: str
     hand: str

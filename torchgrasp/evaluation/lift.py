@@ -95,8 +95,7 @@ def close_hand(
     check_agreement("mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99)
     if table is not None:
         check_stand(mesh, table)
-    truth = Truth(mesh, parts, error, table, neighbours)
-    return lift_grasp(GraspTrial(hand, grasp, truth, seed, told, surface), spec)
+    return lift_grasp(GraspTrial(hand, grasp, Truth(mesh, parts, error, table, neighbours), seed, told, surface), spec)
 
 
 @checked

@@ -125,12 +125,12 @@ class Grasp(Command):
         file = self.view.read("CLOUD", path)
         view = self.view.with_table_of(file)
         cloud, table = file.cloud, view.plane(file.cloud)
+        plane = as_plane(table)
         spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(friction=self.friction, table=table)
-        true_mesh, parts, plane = (None, None, None) if mesh is None else (*read_true_mesh(mesh), None)
+        true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
             check_mesh(cloud, true_mesh, "--mesh")
-            plane = as_plane(table)
             if plane is not None and view.table is None:  # the robot guesses its height, which the true mesh tells
                 plane = dataclasses.replace(plane, offset=float((true_mesh.vertices @ plane.normal.numpy()).min()))
             elif plane is not None:
