@@ -18,7 +18,7 @@ from torchgrasp.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A shipped grasp, its right verdict, the distance [m] of the hand from its place, and the mass [kg] of the object."""
+    """A shipped grasp, its right verdict, how far [m] the hand is from its place, and the mass [kg] of the object."""
 
     object: str
     hand: str
