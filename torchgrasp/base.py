@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
-from torch._C import _functorch as functorch  # pyright: ignore[reportAttributeAccessIssue]
 
 from torchgrasp.checks import Range, check_moved, read_number, show
 from torchgrasp.errors import BadArgument, FailedRows, Status
@@ -51,7 +50,7 @@ class kept(functools.cached_property[Kept]):
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         """Return the value of the property."""
         value = super().__get__(instance, owner)
-        if instance is not None and functorch.peek_interpreter_stack() is not None:
+        if instance is not None and torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore
             vars(instance).pop(self.attrname, None)
         return value
 

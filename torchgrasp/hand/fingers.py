@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float, Int
@@ -13,11 +13,8 @@ from torchgrasp.checks import ANY, checked, is_known
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import real
 from torchgrasp.hand.hand_toml import HandSpec
-from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_chain
+from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf
 from torchgrasp.hand.urdf import Mimic, Urdf
-
-if TYPE_CHECKING:
-    from pytorch_kinematics import Chain
 
 ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
 """Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch."""
@@ -76,10 +73,7 @@ class ActuatedJoints(Value):
         self._refuse(name, joints, (joints < low) | (joints > high), None)
 
     def _refuse(self, name: str, joints: Tensor, wrong: Tensor, allowed: str | None) -> None:
-        """Raise `BadArgument` for the first joint marked as `wrong`. It names `allowed`, or else the joint's range.
-
-        Inside torch.vmap and torch.compile the numbers are not known, and not tested.
-        """
+        """Raise `BadArgument` for the first joint marked as `wrong`; it names `allowed`, or else the joint's range."""
         if not torch.compiler.is_compiling() and is_known(joints) and bool(wrong.any()):
             *batch, k = torch.nonzero(wrong)[0].tolist()
             limits = f"a number in [{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"
@@ -142,7 +136,8 @@ class Fingertips(Value):
     @property
     def cone(self) -> Float[Tensor, "f"]:
         """The half angle [rad] of each pad's cone: the tip may touch only within this angle of the pad's axis."""
-        return torch.where(self.radius > 0, *self.radius.new_tensor([ROUND_PAD, FLAT_PAD]))
+        angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)  # as when results were published
+        return torch.where(self.radius > 0, *angles).to(self.radius)
 
     @kept
     def in_carriers(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
@@ -160,13 +155,13 @@ class Fingertips(Value):
         return frames, frames.index_select(2, self.carrier)
 
 
-def tips_from_files(spec: HandSpec, urdf: Urdf, chain: "Chain") -> Fingertips:
+def tips_from_files(spec: HandSpec, urdf: Urdf, chain: Any) -> Fingertips:
     """Return the fingertips of the grasping fingers, as hand.toml and the URDF's chain describe them."""
     links, tips = [x.name for x in urdf.links], tuple(f.tip_link for f in spec.fingers)
     pads = zip(*(f.pad for f in spec.fingers), strict=True)
     contact, normal, center, radius = map(real, pads)
     carriers, poses = zip(*(pose_in_carrier(chain, tip) for tip in tips), strict=True)
-    chains = tree_from_chain(chain, urdf, carriers)
+    chains = tree_from_urdf(urdf, chain, carriers)
     carrier = torch.tensor([chains.link_names.index(name) for name in carriers], device="cpu")
     index = torch.tensor([links.index(tip) for tip in tips], device="cpu")
     names = tuple(f.name for f in spec.fingers)

@@ -16,22 +16,11 @@ from torchgrasp.checks import Count, Range, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
-from torchgrasp.hand.kinematics import (
-    FreeMotion,
-    KinematicTree,
-    chain_jacobian,
-    chain_poses,
-    map_directions,
-    map_points,
-    serial_chains,
-)  # fmt: skip
+from torchgrasp.hand.kinematics import FreeMotion, KinematicTree, chain_poses, map_directions, map_points
 from torchgrasp.hand.self_collision import SelfCollision
 
 if TYPE_CHECKING:
-    from pytorch_kinematics import Chain, SerialChain
-
-Backend = Literal["torchgrasp", "pytorch_kinematics"]
-"""What computes forward kinematics: compiled tables, or the library of the hand's chain."""
+    from pytorch_kinematics import Chain
 
 
 class Actuator(NamedTuple):
@@ -111,11 +100,6 @@ class Hand(Value):
         moved = super().to(*args, **kwargs)
         chain = copy.deepcopy(self.chain).to(dtype=moved.lower.dtype, device=moved.lower.device)
         return dataclasses.replace(moved, chain=chain)
-
-    @functools.cached_property
-    def finger_chains(self) -> tuple["SerialChain", ...]:
-        """The part of `chain` from the palm to each fingertip's link."""
-        return serial_chains(self.chain, self.tips.links)
 
     @kept
     def motion(self) -> FreeMotion:
@@ -198,7 +182,7 @@ class Hand(Value):
 
     @checked(gradients=True)
     def fingertips(
-        self, joints: Float[Tensor, "*b h"], backend: Backend = "torchgrasp"
+        self, joints: Float[Tensor, "*b h"], backend: Literal["torchgrasp", "pytorch_kinematics"] = "torchgrasp"
     ) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
         """Return the contact points [m] and outward unit normals of the fingertip pads, in the palm's frame.
 
@@ -220,23 +204,12 @@ class Hand(Value):
 
     @checked(gradients=True)
     def jacobian(
-        self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None, backend: Backend = "torchgrasp"
+        self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
         """Return the Jacobian [m/rad] of the fingertips' contact points with respect to the actuated joints.
 
         `at` are points [m] fixed to the fingertips, such as where round tips touch; by default the contact points.
-        With `backend="pytorch_kinematics"` the chain of each finger itself computes the Jacobian.
         """
-        if backend == "pytorch_kinematics":
-            points = self.fingertips(joints, backend)[0] if at is None else at
-            columns, names = self._columns(joints), self.tree.joint_names
-            moved = [
-                chain_jacobian(chain, names, columns, point, self.actuated.coupling)
-                for chain, point in zip(
-                    self.finger_chains, points.reshape(-1, len(self.tips), 3).unbind(1), strict=True
-                )
-            ]
-            return torch.stack(moved, 1).reshape(*points.shape, self.dof)
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
         if at is None:

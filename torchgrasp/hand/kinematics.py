@@ -4,7 +4,6 @@ The pose of a child link in its parent is `constant + sine sin q + cosine cos q 
 the joint between them. The four tables are computed once.
 """
 
-import copy
 import dataclasses
 import functools
 from collections.abc import Collection, Sequence
@@ -21,7 +20,7 @@ from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy, skew
 from torchgrasp.hand.urdf import Urdf
 
 if TYPE_CHECKING:
-    from pytorch_kinematics import Chain, SerialChain
+    from pytorch_kinematics import Chain
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,9 +41,6 @@ class KinematicTree(Value):
     >>> poses = hand.tree.poses(every)
     >>> torch.equal(poses[0, :, :3].permute(1, 2, 0), hand.tree.frames(every.T)[..., 0])
     True
-    >>> axes, origins = hand.tree.joint_axes(poses)
-    >>> axes.shape
-    torch.Size([1, 8, 3])
     """
 
     link_names: tuple[str, ...]
@@ -185,34 +181,29 @@ def chain_from_urdf(urdf: Urdf) -> "Chain":
         return chain.Chain(frames[urdf.root], torch.float64)
 
 
-def tree_from_urdf(urdf: Urdf) -> KinematicTree:
-    """Return the kinematic tree of a URDF, compiled from its chain."""
-    return tree_from_chain(chain_from_urdf(urdf), urdf)
-
-
-def tree_from_chain(chain: "Chain", urdf: Urdf, ends: Collection[str] | None = None) -> KinematicTree:
-    """Return the kinematic tree of a chain, or the part of it that leads to the links `ends`.
+def tree_from_urdf(urdf: Urdf, chain: Any = None, ends: Collection[str] | None = None) -> KinematicTree:
+    """Return the kinematic tree of a URDF's chain, or the part of it that leads to the links `ends`.
 
     Axes, offsets, types and parents are the chain's; links and joints are in the order of the URDF.
     """
-    model: Any = chain  # which declares no types
-    index, paths = chain.frame_to_idx, [path.tolist() for path in model.parents_indices]
+    model: Any = chain or chain_from_urdf(urdf)  # it declares no types
+    index, paths = model.frame_to_idx, [path.tolist() for path in model.parents_indices]
     part = {k for name in (index if ends is None else (urdf.root, *ends)) for k in paths[index[name]]}
     at = [k for x in urdf.links if (k := index[x.name]) in part]
     levels = [[k for k in at if len(paths[k]) == d] for d in range(1, 1 + max(len(paths[k]) for k in at))]
     order, names = [k for level in levels for k in level], [j.name for j in urdf.movable]
-    moved, own, slides = chain.get_joint_parameter_names(), model.joint_indices.tolist(), model.joint_type_indices == 2
+    moved, own, slides = model.get_joint_parameter_names(), model.joint_indices.tolist(), model.joint_type_indices == 2
     joints = [moved.index(name) for name in names]
     frames = [own.index(k) for k in joints]
     new: Any = functools.partial(torch.tensor, device="cpu")
     return KinematicTree(
-        link_names=tuple(chain.idx_to_frame[k] for k in at),
+        link_names=tuple(model.idx_to_frame[k] for k in at),
         joint_names=tuple(names),
         child=new([at.index(k) if k in part else 0 for k in frames], dtype=torch.long),
-        axis=chain.axes[joints],
-        prismatic=slides[frames].to(chain.axes),
+        axis=model.axes[joints],
+        prismatic=slides[frames].to(model.axes),
         moves=real([[float(k in paths[link]) for k in frames] for link in at]),
-        tables=torch.stack([_tables(chain, k) for k in order], -1)[..., None],
+        tables=torch.stack([_tables(model, k) for k in order], -1)[..., None],
         joint=new([joints.index(own[k]) if own[k] >= 0 else 0 for k in order]),
         parent=new([levels[d - 1].index(paths[k][-2]) if d else 0 for d, level in enumerate(levels) for k in level]),
         level_sizes=tuple(map(len, levels)),
@@ -230,29 +221,6 @@ def chain_poses(chain: "Chain", names: Sequence[str], values: Float[Tensor, "j n
     return chain.forward_kinematics_tensor(values[columns].T.to(chain.dtype), analytical_grad=False)
 
 
-def chain_jacobian(
-    chain: "SerialChain", names: Sequence[str], values: Tensor, points: Float[Tensor, "n 3"], coupling: Tensor
-) -> Float[Tensor, "n 3 h"]:
-    """Return the Jacobian of points fixed to a chain's last link by pytorch-kinematics; `coupling` is (j, h)."""
-    poses = chain_poses(chain, names, values)
-    arm = points.to(poses) - poses[-1, :, :3, 3]
-    twist: Any = chain.jacobian_tensor(values, all_transforms=poses)
-    moved = twist[:, :3] + torch.linalg.cross(twist[:, 3:], arm[:, :, None].expand_as(twist[:, 3:]), dim=1)
-    rows = [names.index(name) for name in chain.get_joint_parameter_names()]
-    return moved.to(values) @ coupling[rows].to(values)
-
-
-def serial_chains(chain: "Chain", links: Sequence[str]) -> tuple["SerialChain", ...]:
-    """Return the parts of a chain from its root to some links, made on the CPU and moved to the chain's device."""
-    from pytorch_kinematics import SerialChain
-    from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack as outside_transforms
-
-    with torch.device("cpu"), outside_transforms():
-        whole = copy.deepcopy(chain).to(device="cpu")
-        parts = [SerialChain(whole, link, dtype=chain.dtype) for link in links]
-    return tuple(part.to(device=chain.device) for part in parts)
-
-
 def pose_in_carrier(chain: "Chain", link: str) -> tuple[str, Float[Tensor, "3 4"]]:
     """Return a link's carrier (the nearest link, itself or above, that a joint moves), and the link's pose in it."""
     *above, carrier = chain.parents_indices[chain.frame_to_idx[link]].tolist()
@@ -267,13 +235,14 @@ def pose_in_carrier(chain: "Chain", link: str) -> tuple[str, Float[Tensor, "3 4"
 def _tables(chain: "Chain", frame: int) -> Float[Tensor, "4 3 4"]:
     """Return four 3 x 4 tables: a frame's pose in its parent is their sum, weighted by 1, sin q, cos q and q."""
     offset, kind, joint = chain.joint_offsets[frame], chain.joint_type_indices[frame], chain.joint_indices[frame]
-    constant = chain.identity[0, :3] if offset is None else offset[0, :3]
-    rotation, still = constant[:, :3], torch.zeros_like(constant)
-    if kind == 0:
-        return torch.stack([constant, still, still, still])
-    axis = chain.axes[joint]
+    tables = chain.identity.new_zeros(4, 3, 4)
+    constant, sine, cosine, slide = tables
+    constant[:] = (chain.identity if offset is None else offset)[0, :3]
+    rotation, axis = constant[:, :3].clone(), chain.axes[joint]
     if kind == 2:
-        return torch.stack([constant, still, still, torch.cat([still[:, :3], (rotation @ axis)[:, None]], 1)])
-    cross = skew(axis)  # Rodrigues: I + K sin q + K^2 (1 - cos q), K the cross product with the axis
-    sine, cosine = (torch.cat([x, still[:, 3:]], 1) for x in (rotation @ cross, -rotation @ cross @ cross))
-    return torch.stack([constant - cosine, sine, cosine, still])
+        slide[:, 3] = rotation @ axis
+    elif kind == 1:  # Rodrigues: I + K sin q + K^2 (1 - cos q), K the cross product with the axis
+        cross = skew(axis)
+        sine[:, :3], cosine[:, :3] = rotation @ cross, -rotation @ cross @ cross
+        constant -= cosine
+    return tables

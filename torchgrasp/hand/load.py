@@ -10,7 +10,7 @@ from torchgrasp.hand.collision_shapes import self_collision_from_urdf, spheres_f
 from torchgrasp.hand.fingers import joints_from_files, tips_from_files
 from torchgrasp.hand.hand import Actuator, Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
-from torchgrasp.hand.kinematics import chain_from_urdf, tree_from_chain
+from torchgrasp.hand.kinematics import chain_from_urdf, tree_from_urdf
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.values import Grasps
 
@@ -80,7 +80,7 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
         source=HandSource(spec.option, urdf.path, digest, tuple(spec.options)),
         actuated=joints_from_files(spec, urdf),
         chain=chain,
-        tree=tree_from_chain(chain, urdf),
+        tree=tree_from_urdf(urdf, chain),
         tips=tips_from_files(spec, urdf, chain),
         approach=real(spec.approach),
         actuators={j.name: Actuator(j.effort, j.velocity, spec.kp, spec.kd) for j in urdf.movable},

@@ -10,7 +10,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from torchgrasp.errors import HandFileError
 from torchgrasp.files import read_bounded
 from torchgrasp.hand.safe_xml import SIZES, parse_urdf
 from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
-
-if TYPE_CHECKING:
-    import yourdfpy
 
 REPAIR = "(torchgrasp hand new writes a clean copy)"
 """The end of an error about a published URDF that the library cannot use as it is."""
@@ -165,7 +162,7 @@ def _parse(path: Path, data: bytes) -> Urdf:
 
     clean = parse_urdf(path, data)  # links and joints alone, each with all of its names and with finite numbers
     xml = ET.tostring(clean)
-    robot: yourdfpy.Robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
+    robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
     links = tuple(_link(*pair) for pair in zip(robot.links, clean.findall("link"), strict=True))
     joints = tuple(_joint(*pair) for pair in zip(robot.joints, clean.findall("joint"), strict=True))
     urdf = Urdf(path, robot.name, "", links, joints, data, xml)
@@ -183,11 +180,10 @@ def _place(origin: Any, element: ET.Element | None) -> tuple[Triple, Triple]:
     return (x, y, z), (roll, pitch, yaw)
 
 
-def _link(link: "yourdfpy.Link", element: ET.Element) -> Link:
+def _link(link: Any, element: ET.Element) -> Link:
     """Return a link; its inertia is rotated into the link's axes."""
     shapes = tuple(_shape(*pair) for pair in zip(link.collisions, element.findall("collision"), strict=True))
-    body: Any = link.inertial
-    if body is None:
+    if (body := link.inertial) is None:
         return Link(link.name, 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
     com, rpy = _place(body.origin, element.find("inertial/origin"))
     turn, inertia = body.origin[:3, :3] if any(rpy) else np.eye(3), body.inertia
@@ -195,29 +191,26 @@ def _link(link: "yourdfpy.Link", element: ET.Element) -> Link:
     return Link(link.name, body.mass, com, tuple(turned), shapes)
 
 
-def _shape(collision: "yourdfpy.Collision", element: ET.Element) -> Shape:
+def _shape(collision: Any, element: ET.Element) -> Shape:
     kind, shape = next((kind, shape) for kind, shape in vars(collision.geometry).items() if shape is not None)
     size = [float(x) for key in SIZES[kind] for x in np.atleast_1d(getattr(shape, key))]
     return Shape(kind, tuple(size), *_place(collision.origin, element.find("origin")), getattr(shape, "filename", ""))
 
 
-def _joint(joint: "yourdfpy.Joint", element: ET.Element) -> Joint:
+def _joint(joint: Any, element: ET.Element) -> Joint:
     """Return a joint. Its default axis is x, as in ROS; a continuous joint gets no limits."""
-    read: Any = joint  # the gate has given every attribute a number, but for limits
     xyz, rpy = _place(joint.origin, element.find("origin"))
     if joint.type == "fixed":
-        return Joint(joint.name, "fixed", read.parent, read.child, xyz, rpy)
+        return Joint(joint.name, joint.type, joint.parent, joint.child, xyz, rpy)
     x, y, z = joint.axis.tolist()
     length = math.sqrt(x * x + y * y + z * z)
     length = length if _is_unit(length) else 1.0  # refused later
-    low = high = effort = velocity = None
-    if read.limit is not None:
-        low, high, effort, velocity = (getattr(read.limit, key) for key in ("lower", "upper", "effort", "velocity"))
+    low, high, effort, velocity = (getattr(joint.limit, key, None) for key in ("lower", "upper", "effort", "velocity"))
     if joint.type == "continuous":
         low = high = None
-    mimic = None if read.mimic is None else Mimic(read.mimic.joint, read.mimic.multiplier, read.mimic.offset)
+    mimic = None if joint.mimic is None else Mimic(joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
     return Joint(
-        joint.name, read.type, read.parent, read.child, xyz, rpy, (x / length, y / length, z / length),
+        joint.name, joint.type, joint.parent, joint.child, xyz, rpy, (x / length, y / length, z / length),
         -math.inf if low is None else low, math.inf if high is None else high, effort or 0.0, velocity or 0.0, mimic,
     )  # fmt: skip
 
