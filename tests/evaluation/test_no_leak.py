@@ -113,6 +113,7 @@ def mentioned(hint):
     return seen
 
 
+@functools.cache
 def hints_of(thing):
     """The annotations of a function or class, with names that are imported for type checkers alone."""
     scope = {"trimesh": trimesh} | {name: getattr(torchgrasp, name) for name in torchgrasp.__all__}
