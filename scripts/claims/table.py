@@ -2,6 +2,7 @@
 
 import os
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -51,6 +52,7 @@ def claims(only: str = "", threads: int = 1) -> None:
     """
     from claims import measured  # noqa: F401 - registers the claims
 
+    warnings.simplefilter("ignore")
     torch.set_num_threads(threads)
     chosen = [x for x in CLAIMS if only in x.page or only in x.said]
     print(describe_run(threads), f"Load {', '.join(f'{x:.1f}' for x in os.getloadavg())}.\n")
@@ -59,7 +61,11 @@ def claims(only: str = "", threads: int = 1) -> None:
     for one in chosen:
         if one.check not in results:
             began = time.perf_counter()
-            results[one.check] = *_run(one.check), time.perf_counter() - began
+            try:
+                found, holds = one.check()
+            except Exception as error:
+                found, holds = f"{type(error).__name__}: {error}", False
+            results[one.check] = found, holds, time.perf_counter() - began
         found, holds, took = results[one.check]
         if not one.stands():
             found, holds = "the page says so no more", False
@@ -69,11 +75,3 @@ def claims(only: str = "", threads: int = 1) -> None:
     print(f"\n{held} of {len(chosen)} hold")
     if held < len(chosen):
         raise SystemExit(1)
-
-
-def _run(check: Callable[[], Finding]) -> Finding:
-    """Return the finding of a check; an error is a claim that does not hold."""
-    try:
-        return check()
-    except Exception as error:
-        return f"{type(error).__name__}: {error}", False

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.common import ROOT, Options
 from claims import measured, table
 
-from torchgrasp import ContactSpec, TrialSpec, limits
+from torchgrasp import ContactSpec, TrialSpec, limits, load_hand
 from torchgrasp.app.cli import COMMANDS
 from torchgrasp.app.cli.inputs import MOST_POINTS
 from torchgrasp.cloud.check import FEW_POINTS
@@ -27,6 +27,7 @@ NUMBER = r"(?<![\w.\-])(?:\d[\d,]*(?:\.\d+)?|\.\d+|two|three|four|five|six|seven
 UNIT = r"(?:%|m?s\b|seconds?|minutes?|hours?|[mc]?m\b|N\b|[KMG]i?B\b|deg|rad\b|Hz\b|times\b|points\b|million|of \d+)"
 FIGURE = re.compile(f"{NUMBER}[ -]?{UNIT}")
 
+FOUR = load_hand("allegro", "four")
 SPEC, TRIAL, MIB = ContactSpec(), TrialSpec(), 1024**2
 EXTENT = f"{1e3 * limits.MIN_EXTENT:.0f} mm to {limits.MAX_EXTENT:.0f} m"
 *WIDER, NARROWEST = (f"{1e3 * radius:.0f}" for radius in FLAT_RADII)
@@ -39,7 +40,7 @@ CONSTANTS = {
         f"more than {1e3 * GAP:.0f} mm apart", f"{1e3 * GAP:.0f} mm apart, both", f"fewer than {FEW_POINTS} points",
     ),
     "docs/concepts.md": (f"along a straight {TRIAL.approach:g} m",),
-    "docs/fingers.md": (f"whose {BEST} best grasps",),
+    "docs/fingers.md": (f"whose {BEST} best grasps", f"{','.join(FOUR.finger_names)} {FOUR.dof}"),
     "docs/hands.md": (f"in {POSTURES:,} random postures",),
     "docs/limits.md": (
         f"| {limits.CLOUD_POINTS // 10**6} million, {limits.CLOUD_BYTES // MIB} MB |", f"| {EXTENT} |",
@@ -58,7 +59,7 @@ CONSTANTS = {
 """Texts of pages with limits and defaults, made of the constants of the code."""
 GIVEN = {
     "README.md": ("6 mm", "95 %"),  # a colour of a picture; the intervals
-    "docs/closing.md": ("0.5 N", "0.1 m"),
+    "docs/closing.md": ("0.5 N", "0.1 m", "5 mm"),
     "docs/clouds.md": ("25 mm",),
     "docs/concepts.md": ("70 mm",),  # of scripts/concepts.py
     "docs/exchange.md": ("90 deg",),
