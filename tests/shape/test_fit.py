@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.make import ball, near, real
+from tests.make import ball, cup_view, near, real
 from torchgrasp import PointCloud, ShapeGP, fit_shape
 from torchgrasp.errors import BadArgument, IndefiniteCovariance, SuspiciousScale
 from torchgrasp.shape.conditioning import Criterion
@@ -172,3 +172,21 @@ def test_the_less_is_known_of_the_hidden_side_the_larger_is_its_deviation():
 def test_the_deviation_has_the_factor_of_the_kind_and_the_table(seen_cylinder, table):
     shape = fit_shape(seen_cylinder, table=table)
     assert shape.kind == "revolution" and shape.std_factor == STD_FACTORS[shape.kind, table is not None]
+
+
+def test_the_default_device_and_dtype_change_no_shape(cloud: PointCloud, shape: ShapeGP):
+    view, points = cup_view(0.003), cloud.points[:5]
+    vessel = fit_shape(view, table=0.0)
+    torch.set_default_device("meta")
+    torch.set_default_dtype(torch.float64)
+    try:
+        found, hollow = fit_shape(cloud, table=0.0), fit_shape(view, table=0.0)
+        touched, drawn = found.update(points[:1]), found.sample(points, 2)
+        slopes = found.differentiate(points)
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+    for a, b in ((found, shape), (hollow, vessel), (touched, shape.update(points[:1]))):
+        near(a.weights, b.weights, 1e-9 * float(b.weights.abs().max()))
+    near(drawn, shape.sample(points, 2), 1e-6)
+    assert slopes.normal.dtype == points.dtype and slopes.normal.device.type == "cpu"

@@ -28,7 +28,6 @@ from torchgrasp.values import PointCloud, ShapeEstimate
 MAX_JOINT = 1000  # most points of one joint posterior: its memory grows with the square of their number
 
 
-@checked
 @dataclasses.dataclass(frozen=True)
 class ShapeGP(Posterior, Normalisation):
     """The posterior of an object's signed distance function, Eq. (1) of the paper, given observations; see `fit_shape`.

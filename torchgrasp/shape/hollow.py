@@ -21,7 +21,6 @@ from torchgrasp.values import PointCloud
 Found = TypeVar("Found")
 
 
-@checked
 @dataclasses.dataclass(frozen=True)
 class HollowShape(ShapeGP):
     """The shape of an open vessel: the material between an outer and an inner surface, each a Gaussian process.
