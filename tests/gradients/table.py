@@ -7,19 +7,30 @@ All others refuse such tensors.
 import dataclasses
 import functools
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchgrasp import Contacts, ContactSpec, Hand, Plane, certify, encode, load_hand
+from torchgrasp import Contacts, ContactSpec, Hand, Plane, PointCloud, ShapeGP, certify, encode, load_hand
 from torchgrasp.base import named_tensors
-from torchgrasp.control import squeeze
+from torchgrasp.control import law, squeeze
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.posture_model import GaussianMixture, GraspMixture
 from torchgrasp.posture_model.mixture import CODE_NAMES
+from torchgrasp.shape import (
+    HollowShape,
+    Kernel,
+    Normalisation,
+    Observations,
+    condition,
+    matern52_kernel,
+    rbf_kernel,
+    thin_plate_kernel,
+)
 from torchgrasp.testing import random_joints
 
 Function = Callable[..., Any]
@@ -144,6 +155,61 @@ def pressed(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
     return lambda joints: (press(joints).joints, press(joints).torques), (grasps.joints.to(dtype),)
 
 
+KERNELS: dict[str, Kernel] = {
+    "thin plate": thin_plate_kernel(4.0),
+    "thin plate by autograd": thin_plate_kernel(4.0, closed_form=False),
+    "matern52": matern52_kernel(1.5, 10.0),
+    "rbf": rbf_kernel(1.5, 10.0),
+    "own": Kernel(lambda r: 4.0 / (1.0 + 0.3 * r * r)),
+}
+
+
+SIDES, TOLD, CENTER = normalize(draw(6, 3), dim=-1), 0.1 * draw(6, seed=1), 0.01 * draw(3, seed=2)
+NOISE = torch.linspace(0.02, 0.05, 6, dtype=torch.float64, device="cpu")
+"""Six points of a unit ball, the distances told there, the centre of the frame, and the noise."""
+
+
+def shape_of(kernel: str = "thin plate", distance: Tensor = TOLD, center: Tensor = CENTER) -> ShapeGP:
+    """Return a shape given six points, of which three have normals."""
+    seen = Observations(SIDES, distance, SIDES, NOISE > 0.03, NOISE, 2 * NOISE)
+    return condition(seen, Normalisation(center, 0.05), PointCloud(0.05 * SIDES), kernel=KERNELS[kernel])
+
+
+def vessel_of(center: Tensor = CENTER) -> HollowShape:
+    return HollowShape.join(shape_of(center=center), shape_of("rbf", center=center), PointCloud(0.05 * SIDES))
+
+
+def of_shape(make_shape: Callable[[], ShapeGP], method: str, arguments: tuple[Any, ...] = (), kernel: str = "") -> Make:
+    """Return what makes a method of a shape, a function of points in metres or of normalised ones."""
+
+    def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+        shape, x = make_shape(), 0.8 * normalize(draw(2, 3, seed=3), dim=-1)
+        points = shape.metres(x) if method in METRES[:-1] else x
+        points = shape.distance_rows(x) if method == "whiten" else points
+        call = getattr(shape, method)
+        return (lambda p: call(p, *arguments)), (points.to(dtype),)
+
+    return make
+
+
+METRES = "predict", "differentiate", "joint", "sample", "normalise", "metres"
+NORMALISED = "cross distance_rows estimate jet joint_at mean mean_and_gradient mean_jet whiten".split()
+"""Methods of a shape that take points in any frame and dtype, and those that take normalised points of its own."""
+SHAPES = {"torchgrasp.shape.gp.ShapeGP": shape_of, "torchgrasp.shape.hollow.HollowShape": vessel_of}
+BATCHED = "predict", "differentiate", "normalise", "metres"
+
+
+def of_center(make_shape: Callable[..., ShapeGP]) -> Make:
+    """Return what makes estimates a function of the centre of a shape's frame."""
+    x = torch.full((2, 3), 0.03, dtype=torch.float64, device="cpu")
+    return lambda dtype: ((lambda center: make_shape(center=center).predict(x).distance), (CENTER,))
+
+
+def of_distances(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+    x = shape_of().metres(0.8 * normalize(draw(2, 3, seed=3), dim=-1))
+    return (lambda distance: shape_of(distance=distance).predict(x).distance), (TOLD,)
+
+
 CODE = ("j", *CODE_NAMES)
 PLAIN = ("a", "b")
 GAUSSIAN, GRASP = "torchgrasp.posture_model.gaussian.GaussianMixture", "torchgrasp.posture_model.mixture.GraspMixture"
@@ -216,12 +282,67 @@ ROWS: dict[str, Row] = {
     "torchgrasp.geometry.signed_distance.SignedDistanceField.query": Row(
         "points", TWICE, of_field(lambda dtype: ball().to(dtype).query), 1, note="inside a cell of the grid"
     ),
+    **{
+        f"{owner}.{name}": Row("points", TWICE, of_shape(kind, name, (4,) if name == "sample" else ()), name in BATCHED)
+        for owner, kind in SHAPES.items()
+        for name in METRES
+    },
+    **{
+        f"{owner}.{name}": Row("points", TWICE, of_shape(kind, name), note="in double precision", lacks=("single",))
+        for owner, kind in SHAPES.items()
+        for name in NORMALISED
+    },
+    "torchgrasp.shape.fit.condition": Row("observations, frame, kernel", TWICE, of_distances, lacks=("single",)),
+    "torchgrasp.shape.gp.ShapeGP.of": Row("posterior, frame", TWICE, of_center(shape_of), lacks=("single",)),
+    "torchgrasp.shape.hollow.HollowShape.join": Row("both shapes", TWICE, of_center(vessel_of), lacks=("single",)),
+    "torchgrasp.shape.kernel.Kernel.derivatives": Row(
+        "r, kernel",
+        TWICE,
+        lambda dtype: ((lambda r: KERNELS["rbf"].derivatives(r, 3)), (draw(4).abs().to(dtype) + 0.1,)),
+    ),
+    **{
+        f"torchgrasp.shape.values.Normalisation.{name}": Row(
+            "points", TWICE, of_field(lambda dtype, name=name: getattr(Normalisation(draw(3).to(dtype), 0.05), name)), 1
+        )
+        for name in ("normalise", "metres")
+    },
 }
 MASKS = {
+    *(f"{owner}.{name}" for owner in SHAPES for name in ("contains", "wall_at")),
+    "torchgrasp.shape.hollow.HollowShape.of",  # a vessel is made by `join`
     "torchgrasp.hand.fingers.ActuatedJoints.check", "torchgrasp.hand.fingers.ActuatedJoints.check_limits",
     "torchgrasp.hand.self_collision.SelfCollision.count_near",
 }  # fmt: skip
 """Functions that count, choose or check: they take differentiated tensors, and their results have no derivatives."""
-PENDING = "torchgrasp.hand.", "torchgrasp.shape.", "torchgrasp.control.forces."
+
+
+def of_law(function: Function, *shapes: tuple[int, ...]) -> Row:
+    """Return the row of a pure function of the closing law, twice differentiable in all its arguments."""
+    inputs = [0.1 * draw(2, *shape, seed=k) for k, shape in enumerate(shapes)]
+    return Row("all arguments", TWICE, lambda dtype: (function, tuple(x.to(dtype) for x in inputs)), len(shapes))
+
+
+def spread(root: Tensor) -> Tensor:
+    """Return covariances of a few centimetres."""
+    return 0.1 * root @ root.mT + 0.003 * torch.eye(3, dtype=root.dtype, device=root.device)
+
+
+LAW = {
+    "surface_covariance": of_law(law.surface_covariance, (3,), ()),
+    "printed_covariance": of_law(law.printed_covariance, (3,), ()),
+    "force_covariance": of_law(law.force_covariance, (3,), (3,)),
+    "blend": of_law(lambda error, root: law.blend(error, spread(root)), (3,), (3, 3)),
+    "position_gain": of_law(lambda root: law.position_gain(spread(root)), (3, 3)),
+    "force_gain": of_law(lambda root, alpha: law.force_gain(spread(root), alpha), (3, 3), ()),
+    "damped_inverse": of_law(law.damped_inverse, (2, 4)),
+    "tip_velocity": of_law(law.tip_velocity, (3,), (3,), (), (3,), (3,)),
+    "stay_above": of_law(lambda v, h: law.stay_above(v, h, v.new_tensor([0.0, 0.6, 0.8])), (3,), ()),
+    "joint_step": of_law(
+        lambda jacobian, velocity, error: law.joint_step(jacobian, velocity, 0.01, error), (3, 3, 4), (3, 3), (4,)
+    ),
+}
+"""Functions of `torchgrasp.control.law`, from which a closing law is made; they are not public."""
+LAW |= {f"predict, {name}": Row("points", TWICE, of_shape(partial(shape_of, name), "predict"), 1) for name in KERNELS}
+PENDING = ("nothing.",)
 ROWS = {name: row for name, row in ROWS.items() if not name.startswith(PENDING)}
 MASKS = {name for name in MASKS if not name.startswith(PENDING)}

@@ -15,7 +15,7 @@ from torch.autograd import forward_ad, gradcheck, gradgradcheck
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
 from tests.gradients.compare import F64, every, near, scalar, slopes
-from tests.gradients.table import MASKS, PENDING, ROWS, Function, Row, draw, outputs
+from tests.gradients.table import LAW, MASKS, PENDING, ROWS, Function, Row, draw, outputs
 from tests.hostile.arguments import checked_things, required
 from torchgrasp.base import Value, map_tensors, named_tensors
 from torchgrasp.errors import BadArgument
@@ -142,14 +142,15 @@ def inferred(function: Function) -> Function:
     return call
 
 
+ALL = {**ROWS, **LAW}
 CHECKS = {name.removeprefix("check_"): check for name, check in globals().items() if name.startswith("check_")}
 
 
 @pytest.mark.parametrize("check", CHECKS)
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", ALL)
 @pytest.mark.filterwarnings("ignore")  # torch warns of its own forward mode and compiler
 def test_a_row_of_the_table(name: str, check: str):
-    row = ROWS[name]
+    row = ALL[name]
     if check in row.lacks:
         pytest.skip("the table says that it lacks this")
     CHECKS[check](row, *row.make(F64))
