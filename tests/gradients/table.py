@@ -36,7 +36,6 @@ from torchgrasp.testing import random_joints
 Function = Callable[..., Any]
 Make = Callable[[torch.dtype], tuple[Function, tuple[Tensor, ...]]]
 TWICE, ONCE = 2, 1
-JOINTS, POINTS, CODES = "joints", "points", "codes, parameters"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +119,13 @@ def of_hand(method: str) -> Make:
         return getattr(hand, method), (random_joints(hand, 2, 0).to(dtype),)
 
     return make
+
+
+def jacobian(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+    """Return the Jacobian of points on the fingertips."""
+    hand = hand_of(dtype).to("cpu")
+    joints = random_joints(hand, 2, 0).to(dtype)
+    return hand.jacobian, (joints, hand.fingertips(joints)[0] + 0.001)
 
 
 def of_part(part: str, method: str, argument: Function) -> Make:
@@ -246,15 +252,16 @@ ROWS: dict[str, Row] = {
         of_mixture(GraspMixture, CODE, lambda m, q: m.energy(q), 6, weighted=False),
         note="a minimum over components",
     ),
-    f"{GRASP}.joints": Row(CODES, TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.joints(q), 6)),
+    f"{GRASP}.joints": Row("codes, parameters", TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.joints(q), 6)),
     f"{GRASP}.modes": Row(
-        CODES, TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.modes(q, 2), 6), note="the k largest"
+        "codes, parameters", TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.modes(q, 2), 6), note="the k largest"
     ),
     "torchgrasp.control.forces.squeeze": Row("joints", TWICE, pressed),
     **{
         f"torchgrasp.hand.hand.Hand.{name}": Row("joints", TWICE, of_hand(name), 1)
-        for name in "check_joints expand expand_joints fingertips jacobian link_poses sphere_centres tip_centres".split()  # noqa: E501
+        for name in "check_joints expand expand_joints fingertips link_poses sphere_centres tip_centres".split()
     },
+    "torchgrasp.hand.hand.Hand.jacobian": Row("joints, points `at`", TWICE, jacobian, 2),
     "torchgrasp.hand.hand.Hand.self_clearance": Row(
         "joints", TWICE, of_hand("self_clearance"), 1, note="the least of all pairs"
     ),
@@ -272,12 +279,12 @@ ROWS: dict[str, Row] = {
     "torchgrasp.hand.kinematics.KinematicTree.joint_axes": Row(
         "poses", TWICE, of_part("tree", "joint_axes", lambda h, q: h.link_poses(q)), 1
     ),
-    **{
-        f"torchgrasp.hand.self_collision.SelfCollision.{name}": Row(
-            "frames", TWICE, of_part("self_collision", name, lambda h, q: h.tree.frames(values_of(h, q)))
-        )
-        for name in ("clearance", "separations", "pushes")
-    },
+    "torchgrasp.hand.self_collision.SelfCollision.clearance": Row(
+        "frames",
+        TWICE,
+        of_part("self_collision", "clearance", lambda h, q: h.tree.frames(values_of(h, q))),
+        note="the least of all pairs",
+    ),
     "torchgrasp.geometry.plane.Plane.height": Row("points", TWICE, of_field(lambda _: Plane.horizontal(0.1).height), 1),
     "torchgrasp.geometry.signed_distance.SignedDistanceField.query": Row(
         "points", TWICE, of_field(lambda dtype: ball().to(dtype).query), 1, note="inside a cell of the grid"
@@ -343,6 +350,17 @@ LAW = {
 }
 """Functions of `torchgrasp.control.law`, from which a closing law is made; they are not public."""
 LAW |= {f"predict, {name}": Row("points", TWICE, of_shape(partial(shape_of, name), "predict"), 1) for name in KERNELS}
-PENDING = ("nothing.",)
-ROWS = {name: row for name, row in ROWS.items() if not name.startswith(PENDING)}
-MASKS = {name for name in MASKS if not name.startswith(PENDING)}
+
+
+def page() -> str:
+    """Return the table as it stands in docs/gradients.md; one line has all functions of an owner that are alike."""
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for name, row in ROWS.items():
+        owner, function = name.split(".")[-2:]
+        owner = owner if owner[0].isupper() else ""
+        order = {ONCE: "once", TWICE: "twice"}[row.order]
+        alike.setdefault((owner, row.by, order, row.note), []).append(f"`{function}`")
+    lines = ["| of | functions | differentiable in | how often | note |", "| --- | --- | --- | --- | --- |"]
+    for (owner, by, order, note), functions in sorted(alike.items()):
+        lines.append(f"| {owner and f'`{owner}`'} | {', '.join(functions)} | {by} | {order} | {note} |")
+    return "\n".join(lines) + "\n"

@@ -65,13 +65,13 @@ class SelfCollision(Value):
         apart = torch.where(near[pair, row], apart, torch.inf) if dense else apart
         return least.scatter_reduce(0, row, apart, "amin")
 
-    @checked(gradients=True)
+    @checked
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
         """Return each pair's signed separation [m] in each posture; above `below` it is that of bounding spheres."""
         shapes, apart, pair, row = self._near(frames, below)
         return apart.index_put((pair, row), self._separations(shapes, pair, row))
 
-    @checked(gradients=True)
+    @checked
     def pushes(
         self, frames: Float[Tensor, "3 4 l n"], below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:

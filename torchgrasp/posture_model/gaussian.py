@@ -3,35 +3,33 @@
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch._C._functorch import peek_interpreter_stack
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Range, Seed, check_dense, checked, is_known, is_tracked
+from torchgrasp.base import Kept, Value, kept
+from torchgrasp.checks import Range, Seed, check_dense, checked, is_known
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import cholesky
 
 ROWS_PER_CHUNK = 8192  # rows evaluated together: this bounds the memory for rows x components x dimensions
-Kept = TypeVar("Kept")
 
 
-def kept(compute: Callable[[Any], Kept]) -> Kept:
-    """Return a property of a mixture: computed once, but anew in a transform or if derivatives by it are taken."""
-    name = f"_{compute.__name__}_kept"
+class of_parameters(kept[Kept]):
+    """A property of a mixture that is kept unless a parameter requires a gradient: an optimiser may change it."""
 
-    def get(mixture: Any) -> Any:
-        if torch.compiler.is_compiling() or peek_interpreter_stack() is not None or mixture._is_free:
-            return compute(mixture)  # a tensor made inside a transform of torch.func is of no use outside
-        if name not in mixture.__dict__:
-            with torch.inference_mode(False):  # the result may be used outside of the caller's inference mode
-                mixture.__dict__[name] = compute(mixture)
-        return mixture.__dict__[name]
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
+        """Return the value of the property."""
+        if any(x.requires_grad for x in (instance.weights, instance.means, instance.covariances)):
+            return self.func(instance)
+        found = vars(instance).get(self.attrname)
+        return super().__get__(instance, owner) if found is None else found
 
-    return property(get, doc=compute.__doc__)  # pyright: ignore[reportReturnType]
+    def __set__(self, instance: Any, value: Any) -> None:
+        """Refuse new values; this method also lets Python ask `__get__` for values that are kept."""
+        raise AttributeError(self.attrname)
 
 
 @checked
@@ -81,11 +79,6 @@ class GaussianMixture(Value):
         if bool((info != 0).any()):
             found = f"an indefinite matrix in component {int(info.nonzero()[0])}"
             raise BadArgument("covariances", found, "symmetric positive definite matrices")
-
-    @property
-    def _is_free(self) -> bool:
-        """Whether derivatives are taken by a parameter: an optimiser may change it between two calls."""
-        return any(map(is_tracked, (self.weights, self.means, self.covariances)))
 
     @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
@@ -163,7 +156,7 @@ class GaussianMixture(Value):
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
         return within + torch.einsum("m,mi,mj->ij", self.weights.double(), offset, offset)
 
-    @kept
+    @of_parameters
     def whitening(self) -> "Whitening":
         """Each component's whitening matrix, whitened mean and log scale, which make densities quick to evaluate."""
         means, d, matrix = self.means.double(), len(self.names), whitening_matrices(self.covariances.double())

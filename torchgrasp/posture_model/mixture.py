@@ -17,7 +17,7 @@ from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.geometry.frames import degenerate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand
-from torchgrasp.posture_model.gaussian import GaussianMixture, kept, map_rows
+from torchgrasp.posture_model.gaussian import GaussianMixture, map_rows, of_parameters
 from torchgrasp.values import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
@@ -137,18 +137,18 @@ class GraspMixture(GaussianMixture):
         """Names of the joints, in the order of the hand."""
         return self.names[:-6]
 
-    @kept
+    @of_parameters
     def _code(self) -> GaussianMixture:
         """The mixture over the contact code alone, without the joints, Eq. (22) of the paper."""
         return self.marginal(CODE_NAMES)
 
-    @kept
+    @of_parameters
     def _regression(self) -> Float[Tensor, "m h 6"]:
         """The slope of each component's mean joints over the contact code: Sigma_(Theta,q) Sigma_q^-1 in Eq. (23)."""
         whitening = self._code.whitening.matrix
         return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
 
-    @kept
+    @of_parameters
     def _stacked_regression(self) -> Float[Tensor, "k h"]:
         """Matrices, stacked over components, that multiply (q, 1) to give each component's mean joints at a code q."""
         slope = self._regression
