@@ -145,12 +145,16 @@ def test_the_papers_closing_ends_after_a_tenth_of_a_second_at_half_a_share_with_
     near, far = (observation(x * half, contact=TOUCHING) for x in (0.999, 1.001))
     assert ticks(PaperClosing(reference()), near, 0.05) == 2
     assert ticks(PaperClosing(reference()), far, 0.05) == 40
+    one = dataclasses.replace(at, tips=at.tips + real([[0.0], [0.0], [1.001 * half]]) * NORMALS)
+    assert ticks(PaperClosing(reference()), one, 0.05) == 40  # one finger of three is not there
     two = torch.tensor([True, True, False])
     assert ticks(PaperClosing(reference()), observation(0.0, contact=two), 0.05) == 40
     # A change by NOISE from the forces at the last unsettled tick begins the time again.
     assert ticks(PaperClosing(reference()), averaging(0.0, 0.0999), 0.05) == 2
     assert ticks(PaperClosing(reference()), averaging(0.0, 0.1001), 0.05) == 4
-    assert ticks(PaperClosing(reference()), averaging(*(0.1001 * k for k in range(40))), 0.05) == 40
+    assert ticks(PaperClosing(reference()), averaging(0.0, -0.1001), 0.05) == 4
+    for rise, period in ((0.1001, 0.05), (0.06, 0.02)):  # the change since the time began counts, not that of a tick
+        assert ticks(PaperClosing(reference()), averaging(*(rise * k for k in range(40))), period) == 40
 
 
 def test_the_baseline_is_a_pi_controller_of_each_fingertip():
