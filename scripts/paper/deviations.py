@@ -31,6 +31,7 @@ from torchgrasp import (
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.control.controller import CLOSING_TIME
 from torchgrasp.control.law import blend
+from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.data.shipped import GRASPED, load_shipped_grasp
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.evaluation import PROTOCOLS
@@ -71,13 +72,28 @@ def deviations(out: Path, views: int = 25, starts: int = 300, draws: int = 3, li
 def of_closings() -> Iterator[tuple[str, str]]:
     """Yield how the printed Sigma_cov differs from the one of the closing "uncertainty", on the shipped grasps."""
     floored, entries, shares = 0, 0, []
+    loose, moved, deviation = [], [], []
     for name, hand in sorted(GRASPED):
         plan = ClosingReference.from_grasp(load_hand(hand), load_shipped_grasp(name, hand))
         printed, error = plan.as_printed().gains.covariance, -0.005 * plan.normals
         diagonal = printed.diagonal(dim1=-2, dim2=-1)
         floored, entries = floored + int((diagonal < 1.01e-8).sum()), entries + diagonal.numel()
         shares.append(torch.stack([blend(error, printed), blend(error, plan.gains.covariance)]))
+        model = load_stability(plan.hand)
+        assert model is not None
+        tips = plan.gains.target + plan.hand.tips.radius[:, None] * plan.normals
+        wanted, free = model.preferred_forces(tips, 4.0).forces, model.preferred_forces(tips)
+        led = ClosingReference.from_grasp(plan.hand, load_shipped_grasp(name, hand), 4.0, stability=model)
+        loose.append(float(torch.linalg.vector_norm((wanted[:, None] * plan.normals).sum(0)) / wanted.sum()))
+        moved.append(float((-(led.gains.desired_force * led.normals).sum(-1) - wanted).abs().max()))
+        deviation += free.covariance.diagonal().sqrt().tolist()
     printed, ours = torch.cat(shares, 1)
+    yield (
+        "f_d, the model's normal forces alone: what is unbalanced",
+        f"{min(loose):.0%} to {max(loose):.0%} of their sum",
+    )
+    yield "f_d, balanced: largest change of a normal force", f"{min(moved):.1f} to {max(moved):.1f} N of 4 N"
+    yield "Sigma_fd, deviation of the model's forces", f"{min(deviation):.2f} to {max(deviation):.2f} N, beside 0.3 N"
     yield "Eqs. (26), (27), entries of Sigma_cov that are replaced", f"{floored} of {entries}"
     ends = [f"{float(x.min()):.2f} to {float(x.max()):.2f}" for x in (printed, ours)]
     yield "Eq. (26), lambda 5 mm before a contact", f"{ends[0]} as printed, {ends[1]} with n n^T s^2 + floor^2 I"
@@ -139,7 +155,7 @@ def as_written(x: Tensor, psi: float) -> Tensor:
 
 def of_plans(starts: int, draws: int) -> Iterator[tuple[str, str]]:
     """Yield what becomes of the paper's contacts on the paper's shape of the shipped views, without a table."""
-    beyond = dict.fromkeys(HANDS, 0.0)
+    beyond, on_a_line = dict.fromkeys(HANDS, 0.0), 0
     for name in list_objects():
         accepted: dict[str, list[int]] = {hand: [] for hand in HANDS}
         planned, low = [], []
@@ -150,6 +166,7 @@ def of_plans(starts: int, draws: int) -> Iterator[tuple[str, str]]:
             planned.append(len(contacts))
             low.append(int((contacts.points[..., 2] < 0.0).any(1).sum()))
             code = encode(contacts)
+            on_a_line += int((code.status != Status.OK).sum())
             for hand in HANDS:
                 loaded = load_hand(hand)
                 mixture = load_mixture(mixture_path(loaded.urdf_path.parent))
@@ -160,6 +177,7 @@ def of_plans(starts: int, draws: int) -> Iterator[tuple[str, str]]:
                 beyond[hand] += float(outside.double().mean()) / (draws * len(list_objects()))
         yield f"contacts below the table, {name}", f"{low} of {planned} triples"
         yield f"Eq. (21), triples accepted, {name}", f"{accepted} of {planned}"
+    yield "Eq. (17), triples on a line", f"{on_a_line}"
     yield "Eq. (23), means with a joint beyond its limits", f"{ {hand: f'{x:.0%}' for hand, x in beyond.items()} }"
 
 
