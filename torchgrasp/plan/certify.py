@@ -67,10 +67,7 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
 
 class _Proof(torch.autograd.Function):
-    """The fields of a `Certificate`, and the slope of its margin in the m wrenches, from the wrenches of b sets.
-
-    `flat` tells which sets lie on a line.
-    """
+    """The fields of a `Certificate` given m wrenches, and its margin's slope in them; a `flat` set is on a line."""
 
     @staticmethod
     def forward(wrench: Float[Tensor, "b m 6"], flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
@@ -145,10 +142,7 @@ class _Once(torch.autograd.Function):
 
 
 def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
-    """Return for m wrenches the margin of force closure, the residual force or torque, a witness wrench, and a slope.
-
-    The witness proves that no margin is greater. The slope is the margin's derivative by the wrenches.
-    """
+    """Return for m wrenches the margin of force closure, the residual |W phi|, a witness, and the margin's slope."""
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
     margin, upper = phi.amin(-1), bound_margin(wrench, witness)
@@ -160,8 +154,8 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
         witness[row] = witness[row] if dual is None else torch.from_numpy(dual)
     product = (wrench @ witness[..., None])[..., 0]
     dual = witness / (product - product.amin(-1, keepdim=True)).sum(-1, keepdim=True)
-    slope = torch.where(margin.isinf()[:, None, None], torch.nan, -phi[..., None] * dual[:, None])
-    return margin, residual, witness, slope
+    dual = torch.where(margin.isinf()[:, None], torch.nan, dual)
+    return margin, residual, witness, -phi[..., None] * dual[:, None]
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:

@@ -56,18 +56,13 @@ class GaussianMixture(Value):
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        d = len(self.names)
+        d, weights, covariances = len(self.names), self.weights.detach(), self.covariances.detach()
         if self.means.shape[1] != d:
             raise BadArgument("names", f"{d} names of {self.means.shape[1]} dimensions", "one for each")
         if d < 1 or len(set(self.names)) < d:
             raise BadArgument("names", self.names, "at least one, each once")
-        self._check_numbers(self.weights.detach(), self.covariances.detach())
-
-    def _check_numbers(self, weights: Float[Tensor, "m"], covariances: Float[Tensor, "m d d"]) -> None:
-        """Raise `BadArgument` for weights that are none, and for an indefinite matrix, where numbers are known."""
-        m = len(weights)
-        if m < 1 or (is_known(weights) and not (bool((weights >= 0).all()) and abs(_sum(weights) - 1) <= 1e-6)):
-            found = f"{m} weights, the least {weights.min() if m else None} and sum {_sum(weights)}"
+        if is_known(weights) and not (bool((weights >= 0).all()) and abs(float(weights.double().sum()) - 1) <= 1e-6):
+            found = f"the least weight {weights.min()} and sum {float(weights.sum())}" if len(weights) else "no weights"
             raise BadArgument("weights", found, "at least one, none negative, of sum 1 within 1e-6")
         if not is_known(covariances):
             return
@@ -168,10 +163,6 @@ class GaussianMixture(Value):
         if unknown or len(set(names)) < len(names):
             raise BadArgument("names", unknown or tuple(names), f"some of {', '.join(self.names)}, each once")
         return [self.names.index(name) for name in names]
-
-
-def _sum(weights: Float[Tensor, "m"]) -> float:
-    return float(weights.double().sum())
 
 
 @dataclasses.dataclass(frozen=True)
