@@ -225,6 +225,10 @@ def test_estimates_are_differentiable_in_parameters_of_a_kernel_and_in_the_frame
 
     for function, value in ((by_psi, 4.0), (by_length, 1.5)):
         check(function, torch.tensor(value, dtype=torch.float64), tolerance=1e-7)
+    assert (
+        shape_of("rbf", frame=FRAME.to(torch.float32)).predict(FRAME.metres(POINTS).float()).distance.dtype
+        == torch.float32
+    )
     points, touch, still = FRAME.metres(POINTS), FRAME.metres(POINTS[:1]), torch.eye(4)
     check(lambda c: tensors(shape_of("rbf", frame=Normalisation(c, 0.05)).predict(points).distance), FRAME.center)
     later = lambda y: shape_of("rbf", dataclasses.replace(SEEN, distance=y)).update(touch)  # noqa: E731

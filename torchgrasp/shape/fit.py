@@ -225,7 +225,7 @@ def condition(
             raise BadArgument(
                 f"observations.{name}", "a tensor inside torch.vmap", "the same for all that vmap maps over"
             )
-    observations = observations.to(normalisation.center)
+    observations = observations.to(normalisation.center.device, torch.float64)
     psi = psi_scale * longest_distance(observations.x)
     kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
     posterior = posterior_given(observations, kernel)

@@ -117,7 +117,7 @@ class HollowShape(ShapeGP):
         self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], Found]
     ) -> tuple[list[Found], Callable[..., Tensor]]:
         """Evaluate each wall at the points where it applies; also return a function that merges results in order."""
-        if not all(wall.is_plain(x) for wall in self.walls):
+        if not (self._is_plain(x) and self.inner._is_plain(x)):
             inner = self.wall_at(x)[:, 1]
             walls = [evaluate(wall, x) for wall in self.walls]
             return walls, lambda a, b: torch.where(inner.reshape(-1, *[1] * (a.ndim - 1)), b, a)

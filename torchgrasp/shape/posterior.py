@@ -66,14 +66,14 @@ class Posterior(Value):
     @checked(gradients=True)
     def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
         """Return the mean signed distance at normalised points."""
-        if not self.is_plain(x):
+        if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
         return in_chunks(lambda part: self._evaluate_mean(part, gradient=False), x, 2048)[0]
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
         """Return the mean signed distance and its gradient at normalised points; see `jet`."""
-        if not self.is_plain(x):
+        if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
             return distance, torch.stack(slope, -1)
         size = 512 if x.device.type == "cpu" else 16384
@@ -103,7 +103,7 @@ class Posterior(Value):
             cross = self.cross(x)
             mean = (cross @ self.weights).T
             whitened = self.whiten(cross.reshape(-1, rows)).reshape(4, len(x), rows)
-            if not self.is_plain(cross):
+            if not self._is_plain(cross):
                 return mean, prior - torch.einsum("mqr,pqr->qmp", whitened, whitened)
             spread = prior.repeat(len(x), 1, 1)
             for m in range(4):
@@ -127,14 +127,14 @@ class Posterior(Value):
         variance, k* the covariance of the point with the data, and A the inverse covariance of the data. Its gradient
         is -2 times the gradient of a mean with the weights A k*.
         """
-        size, evaluate = 256 if x.device.type == "cpu" else 16384, _jet if self.is_plain(x) else _differentiable_jet
+        size, evaluate = 256 if x.device.type == "cpu" else 16384, _jet if self._is_plain(x) else _differentiable_jet
         return SurfaceJet(*in_chunks(partial(evaluate, self), x, size))
 
     @checked(gradients=True)
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean distance with first and second derivatives at normalised points, at less cost than `jet`."""
         size = 256 if x.device.type == "cpu" else 16384
-        if not self.is_plain(x):
+        if not self._is_plain(x):
             return MeanJet(*in_chunks(partial(_differentiable_jet, self), x, size)[:3])
         return MeanJet(*in_chunks(lambda part: _mean_jet(self, part)[0], x, size))
 
@@ -158,7 +158,7 @@ class Posterior(Value):
     @checked(gradients=True)
     def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
         """Return the covariance of the distances at normalised points with all observations, one row per point."""
-        if not self.is_plain(x):
+        if not self._is_plain(x):
             d = x[:, None] - self.x
             k, first = differentiate(self.kernel.profile, (d * d).sum(-1) / 2, 2)
             return torch.cat([k, -(first[..., None] * d)[:, : self.n_oriented].mT.flatten(1)], 1)
@@ -173,7 +173,7 @@ class Posterior(Value):
         The dot product of two results is the covariance that the observations explain.
         """
         rows = rows if self.order is None else rows[:, self.order]
-        if not self.is_plain(rows):
+        if not self._is_plain(rows):
             return torch.linalg.solve_triangular(self.factor, rows.T, upper=False).T
         return torch.cat([rows[:, : len(block)] @ block for block in self.whiteners], 1)
 
@@ -182,7 +182,7 @@ class Posterior(Value):
         """Return the covariance of distance and gradient (d, w) at normalised points with all observations."""
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
-    def is_plain(self, x: Tensor) -> bool:
+    def _is_plain(self, x: Tensor) -> bool:
         """Return whether torch neither differentiates points and posterior nor maps over them."""
         return is_plain(x, self.x, self.weights, self.factor)
 
