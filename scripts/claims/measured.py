@@ -167,7 +167,7 @@ def import_time() -> Finding:
 
 @claim(SPEED, "| first executable grasp, cloud to answer | median 0.6 s, worst 1.2 s |")
 def first_grasp() -> Finding:
-    """Time the first batch on the four shipped objects by the processor's clock; a loaded machine may take 1.5 times."""
+    """Time the first batch on the four shipped objects by the processor's clock; loaded machines may take 1.5 times."""
     hand, took = load_hand("allegro"), list[float]()
     for name in ("cylinder", "cylinder", "jug", "rabbit", "spray"):
         grasps, seconds = timed(lambda name=name: plan_grasps(load_object(name).view, hand, TABLE, time_budget=1e-3))
