@@ -22,7 +22,8 @@ from torchgrasp.hand.load import find_hand
 
 HANDS, CAMERA, SPEED, PAPER = "docs/hands.md", "docs/real_camera.md", "docs/results/speed.md", "docs/results/paper.md"
 TABLE = ContactSpec(table=0.0)
-WORK = Path(tempfile.mkdtemp(prefix="claims"))
+FOLDER = tempfile.TemporaryDirectory(prefix="claims")  # deleted at the end
+WORK = Path(FOLDER.name)
 
 
 def call(*words: str | Path) -> str:
