@@ -13,7 +13,7 @@ from torchgrasp.evaluation.lift import LIFT_TIME, _Lift
 from torchgrasp.evaluation.trial import TrialRun
 from torchgrasp.geometry.frames import rotation_from_vector
 
-CENTRE = np.array([0.02, -0.01, 0.03])
+CENTRE = np.array([0.06, -0.03, 0.09])
 """Centre of mass [m] of the authored object in its own frame."""
 CLOSED = 5
 """Number of ticks in which the authored hand closes."""
