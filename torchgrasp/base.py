@@ -49,7 +49,8 @@ class kept(functools.cached_property[Kept]):
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         """Return the value of the property."""
-        value = super().__get__(instance, owner)
+        with torch.inference_mode(False):
+            value = super().__get__(instance, owner)
         if instance is not None and torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore
             vars(instance).pop(self.attrname, None)
         return value
