@@ -67,48 +67,50 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
 
 class _Proof(torch.autograd.Function):
-    """The fields of a `Certificate` given m wrenches, and its margin's slope in them; a `flat` set is on a line."""
+    """The fields of a `Certificate` given m wrenches, then phi and multipliers; a `flat` set is on a line."""
 
     @staticmethod
     def forward(wrench: Float[Tensor, "b m 6"], flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
-        """Return margin, rank ratio, residual, closed, witness and slope; NaN for wrenches that are not finite."""
+        """Return the fields of the certificate, phi and multipliers; NaN for wrenches that are not finite."""
         b, m, _ = wrench.shape
         margin, ratio, residual = (wrench.new_full((b,), torch.nan) for _ in range(3))
-        witness, slope = wrench.new_full((b, 6), torch.nan), wrench.new_full((b, m, 6), torch.nan)
+        witness, phi, dual = (wrench.new_full((b, width), torch.nan) for width in (6, m, 6))
         finite = torch.isfinite(wrench).flatten(1).all(-1)
         known = wrench[finite]
         ratio[finite] = rank_ratio(known[:, None])
-        margin[finite], residual[finite], witness[finite], slope[finite] = _prove(known)
+        margin[finite], residual[finite], witness[finite], phi[finite], dual[finite] = _prove(known)
         balanced = (margin >= MIN_MARGIN) & (residual <= MAX_RESIDUAL)
         closed = balanced & (ratio >= MIN_RANK_RATIO) & ~flat
         lacking = torch.nonzero(balanced & ~closed)[:, 0]
         if len(lacking):
             witness[lacking] = torch.linalg.svd(wrench[lacking], full_matrices=False).Vh[:, -1]
-        return margin, ratio, residual, closed, witness, slope
+        return margin, ratio, residual, closed, witness, phi, dual
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
         """Keep what the derivatives need."""
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(output[3], output[5])
-        ctx.save_for_backward(inputs[0], output[-1])
-        ctx.save_for_forward(inputs[0], output[-1])
+        ctx.mark_non_differentiable(output[3], *output[5:])
+        ctx.save_for_backward(inputs[0], *output[5:])
+        ctx.save_for_forward(inputs[0], *output[5:])
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, None]:
         """Return the derivative in the wrenches; raise `BadArgument` unless it is of the margin alone."""
-        margin, wrench, slope = grads[0], *ctx.saved_tensors
+        margin, wrench, phi, dual = grads[0], *ctx.saved_tensors
         if any(x is not None for x in grads[1:]):
             raise BadArgument("contacts", "a derivative of another field of the certificate", "one of its margin")
-        return None if margin is None else _Once.apply(margin[:, None, None] * slope, wrench), None
+        if margin is None:
+            return None, None
+        return _Once.apply(-margin[:, None, None] * phi[..., None] * dual[:, None], wrench), None
 
     @staticmethod
     def jvp(ctx: Any, *grad_inputs: Any) -> tuple[Tensor | None, ...]:
         """Return the change of the margin; of other fields it is NaN."""
-        wrench, slope = ctx.saved_tensors
-        change = _Once.apply((grad_inputs[0] * slope).sum((1, 2)), wrench)
+        wrench, phi, dual = ctx.saved_tensors
+        change = _Once.apply(-((phi[:, None] @ grad_inputs[0])[:, 0] * dual).sum(-1), wrench)
         unknown = torch.full_like(change, torch.nan)
-        return change, unknown, unknown, None, unknown[:, None].repeat(1, 6), None
+        return change, unknown, unknown, None, unknown[:, None].repeat(1, 6), None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Tensor) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
@@ -142,7 +144,7 @@ class _Once(torch.autograd.Function):
 
 
 def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
-    """Return for m wrenches the margin of force closure, the residual |W phi|, a witness, and the margin's slope."""
+    """Return for m wrenches the margin of force closure, the residual |W phi|, a witness, phi, and the multipliers."""
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
     margin, upper = phi.amin(-1), bound_margin(wrench, witness)
@@ -155,7 +157,7 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
     product = (wrench @ witness[..., None])[..., 0]
     dual = witness / (product - product.amin(-1, keepdim=True)).sum(-1, keepdim=True)
     dual = torch.where(margin.isinf()[:, None], torch.nan, dual)
-    return margin, residual, witness, -phi[..., None] * dual[:, None]
+    return margin, residual, witness, phi, dual
 
 
 def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
