@@ -64,9 +64,8 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
             centers, radius = _cover(shape, cell, 0.0 if touching else bulge)
             rows += [(index, center, radius, finger, touching) for center in centers]
     link_index, center, radius, finger, touching = zip(*rows, strict=True)
-    center, radius = real(center), real(radius)
     link_index, finger, touching = (torch.tensor(x, device="cpu") for x in (link_index, finger, touching))
-    return CollisionSpheres(link_index, center, radius, finger, touching)
+    return CollisionSpheres(link_index, real(center), real(radius), finger, touching)
 
 
 def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:

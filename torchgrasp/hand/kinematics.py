@@ -161,10 +161,7 @@ def map_directions(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 
 
 def chain_from_urdf(urdf: Urdf) -> "Chain":
-    """Return a URDF as a float64 pytorch-kinematics chain; coupled joints become independent.
-
-    The library's own reader rounds angles to float32, so its frames are made here.
-    """
+    """Return a URDF as a pytorch-kinematics chain of independent joints, in float64: its own reader has float32."""
     from pytorch_kinematics import chain, frame, transforms
 
     with torch.device("cpu"):  # the library makes some tensors on torch's default device
