@@ -250,8 +250,7 @@ class _Lift:
 
     def _verdict(self) -> Status:
         """Return the status of a completed trial: `Status.OK` if the object was held, or else the first failure."""
-        last = self.run.robot.ticks(0.2)  # the time [s] at the end of a trial in which contacts are counted
-        judged = judge_lift(self.ticks, self.pressed or 0, last, self.spec.lift_height)
+        judged = judge_lift(self.ticks, self.pressed or 0, self.run.robot.ticks(0.2), self.spec.lift_height)
         if judged in (Status.OK, Status.SLIPPED):
             return judged
         if not np.isfinite(self.run.robot.first_touch).all():
