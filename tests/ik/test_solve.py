@@ -7,8 +7,8 @@ from tests.make import near, real, touched_contacts
 from torchgrasp import Contacts, load_hand, load_mixture, sample_configurations, solve_ik
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
-from torchgrasp.ik import CollisionWorld, PostureLibrary
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.ik import CollisionWorld, PostureLibrary
 from torchgrasp.ik.attempts import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
 
