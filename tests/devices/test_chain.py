@@ -209,3 +209,12 @@ def test_a_closing_is_the_same_wherever_hand_and_grasp_are(device):
     there, near = (close_hand(to(grasp), to(hand), cylinder(), QUICK) for to in (sent, here))
     assert there.held and near.held
     assert np.array_equal(there.forces, near.forces) and np.array_equal(there.object_pose, near.object_pose)
+
+
+@pytest.mark.parametrize("backend", ["torchgrasp", "pytorch_kinematics"])
+def test_fingertips_are_where_the_hand_is(device, hand, backend):
+    joints = random_joints(hand, 5, 0)
+    same(sent(hand).fingertips(sent(joints), backend), hand.fingertips(joints, backend))
+    back = sent(hand).to("cpu")
+    same(back.fingertips(joints, backend), hand.fingertips(joints, backend), CPU)
+    same(sent(hand).jacobian(sent(joints)), hand.jacobian(joints))
