@@ -67,7 +67,7 @@ def pinch(name):
         certificate=Certificate(one, one, 0 * one, torch.tensor([True]), torch.zeros(1, 6)),
         score=one,
         status=torch.zeros(1, dtype=torch.int64),
-        meta={"table": Plane.horizontal(0.0).describe()},
+        meta={"hand": name, "table": Plane.horizontal(0.0).describe()},
     )
 
 
