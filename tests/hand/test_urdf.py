@@ -39,6 +39,16 @@ def test_a_tree_is_read_and_too_large_and_missing_files_are_refused(tmp_path):
         read_urdf(tmp_path)
 
 
+def test_the_same_bytes_are_parsed_once_and_a_changed_file_anew(tmp_path, monkeypatch):
+    path = write(tmp_path, GOOD)
+    first = read_urdf(path)
+    monkeypatch.setattr("torchgrasp.hand.urdf.parse_urdf", None)  # nothing reads again
+    assert read_urdf(path) is first
+    monkeypatch.undo()
+    write(tmp_path, GOOD.replace('upper="1"', 'upper="2"'))
+    assert (first.joints[0].upper, read_urdf(path).joints[0].upper) == (1.0, 2.0)
+
+
 BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>'
 HOSTILE = {
     "doctype": (f"<!DOCTYPE robot>{GOOD}", "declaration"),
@@ -75,6 +85,14 @@ HOSTILE = {
         + JOINT.replace('"j"', '"m"').replace('"a"', '"d"').replace('"b"', '"c"') + "</robot>",
         "cycle",
     ),
+    "line of 101": (
+        '<robot name="r"><link name="l0"/>' + "".join(
+            f'<link name="l{k}"/><joint name="j{k}" type="fixed"><parent link="l{k - 1}"/><child link="l{k}"/></joint>'
+            for k in range(1, 101)
+        ) + "</robot>",
+        "100 links",
+    ),
+    "tab in a name": (GOOD.replace('link name="a"', 'link name="a&#9;"'), "printable"),
     "unknown joint type": (GOOD.replace("revolute", "floating"), "floating"),
     "zero axis": (GOOD.replace('"0 0 1"', '"0 0 0"'), "axis"),
     "axis that hides a ratio": (GOOD.replace('"0 0 1"', '"0 0 0.333"'), "axis"),
