@@ -52,10 +52,8 @@ class _Call:
 
     def check_numbers(self) -> None:
         """Raise `BadArgument` if a tensor to test has NaN or infinity, or a transform to test is not rigid."""
-        for tensors, test, allowed in (
-            (self.finite, torch.isfinite, "finite numbers"),
-            (self.rigid, is_rigid, RIGID),
-        ):
+        tests = (self.finite, torch.isfinite, "finite numbers"), (self.rigid, is_rigid, RIGID)
+        for tensors, test, allowed in tests:
             for name, x in tensors.items():
                 if is_known(x) and not bool((good := test(x)).all()):
                     first = tuple(torch.nonzero(~good)[0].tolist())
@@ -96,10 +94,8 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if gradients and torch.compiler.is_compiling():  # a compiler traces the function, not the checks
-            return function(*args, **kwargs)
-        inside = getattr(_thread, "inside", False)
-        if inside and not always():
+        compiling = gradients and torch.compiler.is_compiling()  # a compiler traces the function, not the checks
+        if compiling or ((inside := getattr(_thread, "inside", False)) and not always()):
             return function(*args, **kwargs)
         bound, shared, hints = signature.bind(*args, **kwargs), _Call(gradients, deep=not inside), _hints(owner)
         if is_method:

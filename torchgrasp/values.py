@@ -254,16 +254,11 @@ class Grasps(Batch):
     @property
     def table(self) -> Plane | None:
         """The table that the planner was given, in the frame of the grasps; None if it had none, or is unknown."""
-        text = self.meta.get("table", "none")
-        return None if text == "none" else read_plane(text)
+        return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
     @checked
     def save(self, path: Path | str) -> None:
-        """Write the grasps as a safetensors file, atomically; `load_grasps` reads it.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Write the grasps as a safetensors file, atomically; `load_grasps` reads it. Raises `OutputError`."""
         save_tensors(path, "grasps", named_tensors(self), self.meta)
 
 
