@@ -114,7 +114,7 @@ def check_dense(name: str, value: Tensor, gradients: bool) -> None:
         raise BadArgument(name, "a tensor with the negative bit", f"one without: {name}.resolve_neg()")
     if is_tracked(value) and not gradients:
         raise BadArgument(name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()")
-    if not (gradients or is_known(value) or torch.compiler.is_compiling()):
+    if not gradients and any(map(functorch.is_batchedtensor, _levels(value))):
         raise BadArgument(name, "a tensor inside torch.vmap", "a plain tensor: the function is not differentiable")
 
 
