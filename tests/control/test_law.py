@@ -9,7 +9,7 @@ import torch
 
 from tests.make import directions
 from torchgrasp import ClosingReference, closing_gains, load_hand
-from torchgrasp.control.forces import contacts_in_hand, joint_stiffness, tip_compliance
+from torchgrasp.control.forces import contacts_in_hand, desired_forces, joint_stiffness, tip_compliance
 from torchgrasp.control.law import (
     FORCE_BANDWIDTH,
     FORCE_FLOOR,
@@ -198,5 +198,6 @@ def test_reference_approaches_the_forces_that_the_stability_model_prefers():
     (hand, grasp, points, normals), model = shipped("barrett"), load_stability(load_hand("barrett"))
     wanted = model.preferred_forces(points + hand.tips.radius[:, None] * normals, 4.0).forces
     even, led = (ClosingReference.from_grasp(hand, grasp, 4.0, stability=x).gains.desired_force for x in (None, model))
+    assert torch.allclose(led, desired_forces(points, normals, 4.0, wanted), atol=1e-9)
     even, led = (float((-(x * normals).sum(-1) - wanted).norm()) for x in (even, led))
     assert led < 0.9 * even

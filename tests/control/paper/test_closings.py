@@ -118,6 +118,23 @@ def test_the_papers_law_needs_the_variance_of_the_signed_distance():
     assert torch.equal(found.gains.covariance, ClosingReference.from_grasp(hand, grasp).gains.covariance)
 
 
+def test_a_target_leads_a_blocked_joint_by_the_greatest_torque_of_its_drive():
+    hand, _, _, plan, seen = drawn_plan("barrett", 0)
+    plan = dataclasses.replace(plan, kp=100.0 * plan.kp, joints=plan.pregrasp)  # so firm that the bound is near
+    effort = [hand.actuators[name].effort for name in hand.tree.joint_names]
+    coupling = hand.actuated.coupling.numpy()
+    most = [
+        min(effort[j] / float(plan.kp[j]) / abs(row[k]) for j, row in enumerate(coupling) if row[k])
+        for k in range(hand.dof)
+    ]
+    law = PaperClosing(plan)
+    np.testing.assert_allclose(law.lead.numpy(), most, rtol=1e-12)
+    for _ in range(60):
+        law(seen, 0.01)  # the joints do not move
+    ahead = (law.target - plan.pregrasp).abs().numpy()
+    assert (ahead <= np.array(most) + 1e-12).all() and np.isclose(ahead, most).any()
+
+
 def ticks(law, seen, period: float, most: int = 40) -> int:
     """The number of ticks after which a closing is done; `seen` may depend on the tick."""
     for k in range(most):

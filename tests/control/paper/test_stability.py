@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from train.stability import fit_stability
@@ -77,6 +78,29 @@ def test_preferred_forces_are_the_regression_on_the_lengths(model: StabilityMode
     assert torch.allclose(moved.forces, narrow.forces)
     with pytest.raises(BadArgument, match="tips"):
         model.preferred_forces(tips(float("nan")))
+
+
+def test_preferred_forces_and_their_covariance_in_numpy(model: StabilityModel):
+    """Of one Gaussian over logarithms: its conditional on the lengths, and the covariance f_i S_ij f_j of forces."""
+    mean, cov = model.stable.means[0].double().numpy(), model.stable.covariances[0].double().numpy()
+    lengths = lengths_of(tips(0.05)).log().numpy()
+
+    def condition(given: list[int], values: np.ndarray, asked: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        gain = cov[np.ix_(asked, given)] @ np.linalg.inv(cov[np.ix_(given, given)])
+        return mean[asked] + gain @ (values - mean[given]), cov[np.ix_(asked, asked)] - gain @ cov[np.ix_(given, asked)]
+
+    log, spread = condition([3, 4, 5], lengths, [6, 7, 8])
+    free, forces = model.preferred_forces(tips(0.05)), np.exp(log)
+    np.testing.assert_allclose(free.forces.numpy(), forces, rtol=1e-6)
+    np.testing.assert_allclose(free.covariance.numpy(), forces[:, None] * spread * forces, rtol=1e-5)
+    stiff = condition([3, 4, 5], lengths, [0, 1, 2])[0]
+    np.testing.assert_allclose(free.springs.numpy(), np.exp(stiff), rtol=1e-6)
+    asked = model.preferred_forces(tips(0.05), 3.0)
+    log, spread = condition([3, 4, 5, 8], np.append(lengths, np.log(3.0)), [6, 7])  # the third finger presses hardest
+    forces = np.append(np.exp(log), 3.0)
+    np.testing.assert_allclose(asked.forces.numpy(), forces, rtol=1e-6)
+    spread = np.pad(spread, (0, 1))
+    np.testing.assert_allclose(asked.covariance.numpy(), forces[:, None] * spread * forces, rtol=1e-5, atol=1e-12)
 
 
 def test_stability_file_is_read_back_and_refused_for_another_hand_or_a_bad_fit(model: StabilityModel, tmp_path):
