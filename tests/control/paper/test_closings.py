@@ -12,6 +12,7 @@ from tests.point_fingers import NORMALS, TARGET, TOUCHING, observation, referenc
 from torchgrasp import ClosingReference, load_hand
 from torchgrasp.control import GraspController, no_contact, observe
 from torchgrasp.control.forces import joint_stiffness
+from torchgrasp.control.law import joint_step
 from torchgrasp.control.paper.closings import PaperClosing, PositionClosing
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.data.shipped import load_shipped_grasp
@@ -133,6 +134,11 @@ def test_a_target_leads_a_blocked_joint_by_the_greatest_torque_of_its_drive():
         law(seen, 0.01)  # the joints do not move
     ahead = (law.target - plan.pregrasp).abs().numpy()
     assert (ahead <= np.array(most) + 1e-12).all() and np.isclose(ahead, most).any()
+
+
+def test_a_tick_turns_no_joint_by_more_than_a_twentieth_of_a_radian():
+    step = joint_step(torch.eye(9).double().reshape(3, 3, 9), real([[9.0, 0, 0], [0, 1, 0], [0, 0, 0]]), 0.01)
+    assert torch.allclose(step, 0.05 * torch.eye(9).double()[0] + 0.05 / 9 * torch.eye(9).double()[4])
 
 
 def ticks(law, seen, period: float, most: int = 40) -> int:

@@ -8,7 +8,7 @@ import torch
 from train.stability import fit_stability
 
 from torchgrasp import load_hand
-from torchgrasp.control.paper.stability import LEAST_FORCE, NAMES, StabilityModel, lengths_of, load_stability, state_of
+from torchgrasp.control.paper.stability import NAMES, StabilityModel, lengths_of, load_stability, state_of
 from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
@@ -42,7 +42,7 @@ def test_lengths_are_those_of_the_code_in_any_frame():
     turned = points @ rotation_from_vector(torch.tensor([0.3, 0.4, -0.2]).double()).T + 0.1
     assert torch.allclose(lengths_of(turned), lengths_of(points))
     quiet = state_of(torch.ones(3), torch.ones(3), torch.tensor([-0.1, 0.0, 1.0]))
-    assert quiet[6:].exp().tolist() == pytest.approx([LEAST_FORCE, LEAST_FORCE, 1.0])
+    assert quiet[6:].exp().tolist() == pytest.approx([0.05, 0.05, 1.0])
 
 
 def test_log_odds_rank_held_grasps_above_others():
