@@ -191,15 +191,18 @@ def of_shape(make_shape: Callable[[], ShapeGP], method: str, arguments: tuple[An
     def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
         shape, x = make_shape(), 0.8 * normalize(draw(2, 3, seed=3), dim=-1)
         points = shape.metres(x) if method in METRES[:-1] else x
-        points = shape.distance_rows(x) if method == "whiten" else points
+        points = shape.distance_rows(x) if method in ("whiten", "ordered") else points
+        points = points.mT if method == "ordered" else points
         call = getattr(shape, method)
         return (lambda p: call(p, *arguments)), (points.to(dtype),)
 
     return make
 
 
+UNCOMPILED = "not inside torch.compile"
+FITS = UNCOMPILED, ("single", "compile")
 METRES = "predict", "differentiate", "joint", "sample", "normalise", "metres"
-NORMALISED = "cross distance_rows estimate jet joint_at mean mean_and_gradient mean_jet whiten".split()
+NORMALISED = "cross distance_rows estimate jet joint_at mean mean_and_gradient mean_jet whiten ordered".split()
 """Methods of a shape that take points in any frame and dtype, and those that take normalised points of its own."""
 SHAPES = {"torchgrasp.shape.gp.ShapeGP": shape_of, "torchgrasp.shape.hollow.HollowShape": vessel_of}
 BATCHED = "predict", "differentiate", "normalise", "metres"
@@ -290,18 +293,36 @@ ROWS: dict[str, Row] = {
         "points", TWICE, of_field(lambda dtype: ball().to(dtype).query), 1, note="inside a cell of the grid"
     ),
     **{
-        f"{owner}.{name}": Row("points", TWICE, of_shape(kind, name, (4,) if name == "sample" else ()), name in BATCHED)
+        f"{owner}.{name}": Row(
+            "points",
+            TWICE,
+            of_shape(kind, name, (4,) if name == "sample" else ()),
+            name in BATCHED,
+            *((UNCOMPILED, ("compile",)) if name == "differentiate" else ()),
+        )
         for owner, kind in SHAPES.items()
         for name in METRES
     },
     **{
-        f"{owner}.{name}": Row("points", TWICE, of_shape(kind, name), note="in double precision", lacks=("single",))
+        f"{owner}.{name}": Row(
+            "rows" if name in ("whiten", "ordered") else "points",
+            TWICE,
+            of_shape(kind, name),
+            note="in double precision" + f"; {UNCOMPILED}" * ("jet" in name),
+            lacks=("single", "compile") if "jet" in name else ("single",),
+        )
         for owner, kind in SHAPES.items()
         for name in NORMALISED
     },
-    "torchgrasp.shape.fit.condition": Row("observations, frame, kernel", TWICE, of_distances, lacks=("single",)),
-    "torchgrasp.shape.gp.ShapeGP.of": Row("posterior, frame", TWICE, of_center(shape_of), lacks=("single",)),
-    "torchgrasp.shape.hollow.HollowShape.join": Row("both shapes", TWICE, of_center(vessel_of), lacks=("single",)),
+    "torchgrasp.shape.fit.condition": Row(
+        "observations, frame, kernel", TWICE, of_distances, 0, UNCOMPILED, ("single", "compile")
+    ),
+    "torchgrasp.shape.gp.ShapeGP.of": Row(
+        "posterior, frame", TWICE, of_center(shape_of), 0, UNCOMPILED, ("single", "compile")
+    ),
+    "torchgrasp.shape.hollow.HollowShape.join": Row(
+        "both shapes", TWICE, of_center(vessel_of), 0, UNCOMPILED, ("single", "compile")
+    ),
     "torchgrasp.shape.kernel.Kernel.derivatives": Row(
         "r, kernel",
         TWICE,

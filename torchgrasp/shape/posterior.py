@@ -58,7 +58,7 @@ class Posterior(Value):
         """Number of observed points with normals."""
         return int(self.has_normal.sum())
 
-    @checked
+    @checked(gradients=True)
     def ordered(self, rows: Shaped[Tensor, "rows *c"]) -> Shaped[Tensor, "rows *c"]:
         """Return rows, given in the order of `weights`, in the order of the rows of `factor`."""
         return rows if self.order is None else rows[self.order]
