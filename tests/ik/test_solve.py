@@ -7,7 +7,6 @@ from tests.make import near, real, touched_contacts
 from torchgrasp import Contacts, load_hand, load_mixture, sample_configurations, solve_ik
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
-from torchgrasp.geometry.linalg import unit
 from torchgrasp.ik import CollisionWorld, PostureLibrary
 from torchgrasp.ik.attempts import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
@@ -79,20 +78,17 @@ def test_the_frame_of_the_contacts_does_not_matter(scene):
     near(move @ here.obj_from_hand, there.obj_from_hand, 1e-6)
 
 
-def test_cobyla_moves_pose_and_joints_until_round_tips_touch_the_contacts_from_any_direction():
+def test_cobyla_moves_pose_and_joints_until_the_contact_points_meet():
     hand = load_hand("barrett")
     true = real([[0.3, 0.9, 1.0, 0.8], [0.1, 1.2, 0.6, 1.0]])
-    centres = hand.tip_centres(true)
-    normals = unit(real([0.3, 0.9, -0.2])).expand(2, 3, 3)  # far from the pads' axes
-    contacts = Contacts(centres - hand.tips.radius[:, None] * normals, normals)
-    nowhere = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    points, normals = hand.fingertips(true)
+    contacts, nowhere = Contacts(points, -normals), torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
     solution = refine_by_cobyla(hand, Configuration(true + 0.05, nowhere), contacts, CollisionWorld())
-    tips = hand.tip_centres(solution.joints)
-    assert float((apply(solution.obj_from_hand, tips) - centres).norm(dim=-1).max()) < 1e-4
-    near(solution.obj_from_hand @ virtual_frame(tips), virtual_frame(centres), 1e-9)
+    tips = hand.fingertips(solution.joints)[0]
+    assert float((apply(solution.obj_from_hand, tips) - points).norm(dim=-1).max()) < 1e-4
+    near(solution.obj_from_hand @ virtual_frame(tips), virtual_frame(points), 1e-9)
     hand.check_joints(solution.joints)
-    points, pads = hand.fingertips(true[:1])
-    by_name = solve_ik(hand, Contacts(points, -pads), load_mixture("barrett"), method="cobyla")
+    by_name = solve_ik(hand, contacts[:1], load_mixture("barrett"), method="cobyla")
     assert by_name.status[0] == Status.OK
 
 

@@ -147,13 +147,12 @@ def refine_by_cobyla(hand: Hand, start: Configuration, contacts: Contacts, world
     """Move hand configurations onto three contacts each by SciPy's COBYLA; the poses in `start` are not used."""
     if not len(start):
         return start
-    centres = tip_targets(hand, contacts)  # a round tip touches its contact from any direction
-    rows = [CobylaRun(hand, q, p, world).solve() for q, p in zip(start.joints, centres, strict=True)]
+    rows = [CobylaRun(hand, q, p, world).solve() for q, p in zip(start.joints, contacts.points, strict=True)]
     return join(rows).to(start.joints.dtype)
 
 
 class CobylaRun:
-    """One run of SciPy's COBYLA from `joints` [rad] to three tip centres at `points` [m]; caches the last values."""
+    """One run of SciPy's COBYLA from initial `joints` [rad] onto three contact `points` [m]; caches the last values."""
 
     def __init__(self, hand: Hand, joints: Float[Tensor, "h"], points: Float[Tensor, "3 3"], world: CollisionWorld):
         self.hand, self.world = hand, world
@@ -177,11 +176,11 @@ class CobylaRun:
         return joints, frames, virtual_frame(self.points) @ inverse(virtual_frame(tips)), True
 
     def tips(self, frames: Float[Tensor, "3 4 l 1"]) -> Float[Tensor, "3 3"]:
-        """Return the centres [m] of the fingertips in the hand's frame, given the link frames."""
-        return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.center)[..., 0].T
+        """Return the contact points [m] of the fingertips in the hand's frame, given the link frames."""
+        return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.contact)[..., 0].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of the centres' distances from `points` [mm], and the clearances less 0.5 mm, to be >= 0."""
+        """Return the sum of tip distances from contacts [mm], and the clearances less 0.5 mm, which must be >= 0."""
         key = np.asarray(x).tobytes()
         if self.last is None or self.last[0] != key:
             _, frames, pose, framed = self.place(x)

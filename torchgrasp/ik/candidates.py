@@ -116,12 +116,14 @@ def measure_errors(
     """Measure the errors and clearances of grasps; `status` tells the first error out of tolerance.
 
     With `rolling`, round fingertips may roll on their contacts within the cones of their pads. Without `rolling`, as in
-    the paper, round fingertips may touch their contacts in any direction. `tolerance` [m] is the largest allowed
+    the paper, each pad must touch with its own contact point, in any direction. `tolerance` [m] is the largest allowed
     distance of a tip from its contact. NaN is out of tolerance.
     """
     spatial = SpatialJacobian.at(hand, configuration)
-    target = tip_targets(hand, contacts)
-    error = torch.linalg.vector_norm(spatial.points(hand.tips.index, hand.tips.center) - target, dim=-1)
+    touching, target = hand.tips.contact, contacts.points
+    if rolling:
+        touching, target = hand.tips.center, tip_targets(hand, contacts)
+    error = torch.linalg.vector_norm(spatial.points(hand.tips.index, touching) - target, dim=-1)
     pads = spatial.pads.permute(2, 1, 0)
     angle = torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))  # from the inward normal
     links, depth, table = link_clearance(spatial, world, tips_touch=True)

@@ -76,8 +76,8 @@ def solve_ik(
         contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not used.
         mixture: the hand's learned model; without it, all initial guesses come from `library`.
         world: object, table and obstacles that the links must not touch; by default, only self-collision counts.
-        method: "cobyla" is the paper's method (Sec. 6.3), which brings each round tip to touch its contact, in any
-            direction.
+        method: "cobyla" is the paper's method (Sec. 6.3), which brings each tip's contact point to its contact and
+            ignores the contact directions.
         library: the hand's random postures; by default they are drawn when they are needed.
 
     Returns:
