@@ -18,7 +18,7 @@ python scripts/reproduce.py claims            the figures of README and guides a
 """
 
 import tyro
-from claims.table import claims
+from claims.run import claims
 from paper.deviations import deviations
 from paper.fig4 import fig4
 from paper.fig6 import fig6

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.common import ROOT, Options
-from claims import measured, table
+from claims import measured, run, table
 
 from torchgrasp import ContactSpec, TrialSpec, limits, load_hand
 from torchgrasp.app.cli import COMMANDS
@@ -113,12 +113,12 @@ def test_the_table_of_the_readme_is_that_of_the_results():
 def test_claims_end_with_1_where_one_does_not_hold(monkeypatch, capsys):
     right = table.Claim("README.md", "# torchgrasp", lambda: ("so", True))
     gone, broken = right._replace(said="no such text"), right._replace(check=lambda: (str(1 / 0), True))
-    monkeypatch.setattr(table, "CLAIMS", [right])
-    table.claims()
+    monkeypatch.setattr(run, "CLAIMS", [right])
+    run.claims()
     assert "| README.md | # torchgrasp | so (run: 0 s) | yes |" in capsys.readouterr().out
-    monkeypatch.setattr(table, "CLAIMS", [right, gone, broken])
+    monkeypatch.setattr(run, "CLAIMS", [right, gone, broken])
     with pytest.raises(SystemExit):
-        table.claims()
+        run.claims()
     said = capsys.readouterr().out
     assert said.endswith("1 of 3 hold\n") and "says so no more" in said and "ZeroDivisionError" in said
 
