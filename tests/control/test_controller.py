@@ -14,6 +14,7 @@ from torchgrasp.control.holding import RAMP, ForceHold, held_forces
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.control.recovery import PRESSING_TIME
 from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.linalg import fibonacci_sphere
 
 PRESSED = (2.0, 2.0, 4.0)
 CLOSE = TARGET * real([1.0, 1.0, 0.2])  # two contacts side by side: unequal forces need little friction
@@ -57,6 +58,23 @@ def test_desired_forces_approach_preferred_proportions_and_held_ones_keep_those_
     )
     assert led.sum(0).abs().max() < 1e-9
     assert off(led, planned / 4.0) < 0.5 * off(even, planned / 4.0)
+
+
+def test_forces_of_three_contacts_trade_friction_against_the_preferred_proportions():
+    """All directions in the null space are tried: the friction needed, and 0.2 of the distance from the proportions."""
+    preferred, sides = real([0.8, 0.2, 1.0]), TARGET.roll(-1, 0) - TARGET
+    sides = sides / sides.norm(dim=1, keepdim=True)
+    w = fibonacci_sphere(200_000).double()
+    tried = w[:, :, None] * sides - (w[:, :, None] * sides).roll(1, 1)
+
+    def cost(forces: torch.Tensor) -> torch.Tensor:
+        push = -(forces * NORMALS).sum(-1)
+        across = (forces + push[..., None] * NORMALS).norm(dim=-1)
+        far = (push / push.amax(-1, keepdim=True) - preferred).norm(dim=-1)
+        return torch.where(push.amin(-1) > 0, (across / push).amax(-1) + 0.2 * far, torch.inf)
+
+    found = cost(desired_forces(TARGET, NORMALS, 4.0, preferred))
+    assert 0.05 < float(found) < 1.001 * float(cost(tried).min())
 
 
 def test_force_hold_exerts_the_forces_and_regulates_their_sum():

@@ -11,7 +11,6 @@ from tests.make import real
 from tests.point_fingers import NORMALS, TARGET, TOUCHING, observation, reference
 from torchgrasp import ClosingReference, load_hand
 from torchgrasp.control import GraspController, no_contact, observe
-from torchgrasp.control.forces import joint_stiffness
 from torchgrasp.control.law import joint_step
 from torchgrasp.control.paper.closings import PaperClosing, PositionClosing
 from torchgrasp.control.paper.stability import load_stability
@@ -84,8 +83,9 @@ def test_eqs_25_to_28_of_the_paper_in_numpy(name):
         radius = hand.tips.radius.numpy()[:, None]
         dev = model.preferred_forces(torch.tensor(points + radius * normal)).covariance.diagonal().sqrt().numpy()
         at_contacts = hand.jacobian(grasp.joints.double(), torch.tensor(points)[None])[0].numpy()
-        yields = np.einsum("fch,fc->fh", at_contacts, normal) ** 2 / joint_stiffness(hand).numpy()
         coupling = hand.actuated.coupling.numpy()
+        firm = np.array([hand.actuators[joint].kp for joint in hand.tree.joint_names]) @ coupling**2
+        yields = np.einsum("fch,fc->fh", at_contacts, normal) ** 2 / firm
         oracle = printed_law(
             normal, f_cov, dev, yields.sum(1), plan.gains.target.numpy(), seen.tips.numpy() - radius * normal,
             (plan.gains.desired_force.numpy() * normal).sum(1, keepdims=True) * normal, seen.tactile.reading.numpy(),
