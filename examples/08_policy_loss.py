@@ -24,6 +24,6 @@ for step in range(0, 61):
     known = torch.isfinite(margin)  # -inf: the forces do not balance, and the margin has no gradient
     (gradient,) = torch.autograd.grad(margin[known].sum(), actions)
     if step % 20 == 0:
-        closed, mean = int((margin > 1e-6).sum()), float(margin[known].mean())
+        closed, mean = int((margin > 1e-6).sum()), float(margin[known].detach().mean())
         print(f"step {step}: {closed} of 64 contact sets have force closure, mean margin {mean:.4f}")
     actions = actions.detach() + 0.5 * torch.where(known[:, None, None], gradient, 0.0)

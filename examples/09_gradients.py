@@ -23,7 +23,7 @@ for _ in range(300):
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
-print(f"mean log-likelihood: {float(-loss):.2f} by descent, {float(em.log_prob(rows).mean()):.2f} by EM")
+print(f"mean log-likelihood: {float(-loss.detach()):.2f} by descent, {float(em.log_prob(rows).mean()):.2f} by EM")
 
 # 2. Forward kinematics, the shape's posterior and the posture model form one loss of the joints [rad].
 view = load_object("cylinder").view
@@ -40,9 +40,9 @@ def loss_of(joints: torch.Tensor) -> torch.Tensor:
     return (off**2 + (1e3 * surface.std_m) ** 2).sum() + model.energy(encode((points, normals))).amin()
 
 
+print(f"loss {float(loss_of(joints)):.1f} of the spoiled grasp,", end=" ")
 joints.requires_grad_()
 optimiser = torch.optim.LBFGS([joints], max_iter=25, line_search_fn="strong_wolfe")
-print(f"loss {float(loss_of(joints)):.1f} of the spoiled grasp,", end=" ")
 
 
 def evaluate() -> torch.Tensor:
@@ -54,5 +54,6 @@ def evaluate() -> torch.Tensor:
 
 
 optimiser.step(evaluate)
-curvature = torch.func.hessian(loss_of)(joints.detach())[0, :, 0]
+joints = joints.detach()
+curvature = torch.func.hessian(loss_of)(joints)[0, :, 0]
 print(f"{float(loss_of(joints)):.1f} after descent, with curvatures {torch.linalg.eigvalsh(curvature).numpy().round()}")

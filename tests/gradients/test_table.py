@@ -145,12 +145,21 @@ ALL = {**ROWS, **LAW}
 ALIKE = re.compile(
     r"HollowShape\.(?!predict|mean$)|GraspMixture\.(log|marg|cond)|jet|joint_at|estimate|predict, "
 ).search
-"""Finds rows that share most of their code with others; a quick run leaves them out, and none is compiled."""
+"""Finds rows that share most of their code with others; a quick run leaves them out."""
 CHECKS = {name.removeprefix("check_"): check for name, check in globals().items() if name.startswith("check_")}
 
 
-@pytest.mark.parametrize("check", CHECKS)
-@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if ALIKE(x) else x for x in ALL])
+def cells() -> Iterator[Any]:
+    """Yield the rows and checks that are tried; of rows that share their code, the derivatives alone."""
+    for name in ALL:
+        for check in CHECKS:
+            if not ALIKE(name):
+                yield pytest.param(name, check)
+            elif check in ("backward", "double_backward", "hessian", "vmap", "jvp"):
+                yield pytest.param(name, check, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("name", "check"), cells())
 @pytest.mark.filterwarnings("ignore")  # torch warns of its own forward mode and compiler
 def test_a_row_of_the_table(name: str, check: str):
     row = ALL[name]
