@@ -8,7 +8,6 @@ from torchgrasp import ContactSpec, Status, TrialSpec, close_hand, list_objects,
 from torchgrasp.files import format_columns
 from torchgrasp.values import Grasps, IKSeeds
 
-SPEC = ContactSpec.paper(table=0.0)
 TRIAL = TrialSpec(closing="paper", holding="impedance")
 
 TITLE = ("object", "hand", "closed", "Eq. 21", "assigned", "COBYLA", "tips", "links", "rest", "good", "held")
@@ -16,7 +15,7 @@ TITLE = ("object", "hand", "closed", "Eq. 21", "assigned", "COBYLA", "tips", "li
 
 def funnel(
     starts: int = 1000, seed: int = 0, hands: tuple[str, ...] = ("allegro", "barrett"), only: tuple[str, ...] = (),
-    lifted: int = 3,
+    lifted: int = 3, edges: int = 8,
 ) -> None:  # fmt: skip
     """Print for each object and hand how many triples, assignments and grasps are left after each stage of the paper.
 
@@ -29,21 +28,23 @@ def funnel(
         hands: by name.
         only: names of objects; by default all of the project's.
         lifted: grasps of each object and hand that are closed and lifted; 0 needs no simulator.
+        edges: of each friction cone in Eq. (13), whose number the paper does not give; fewer edges leave more margin.
     """
     torch.set_num_threads(1)
+    spec = ContactSpec.paper(edges=edges, table=0.0)
     lines: list[tuple[str, ...]] = [TITLE]
     for name in only or list_objects():
         for hand in hands:
-            lines.append((name, hand, *map(str, count_stages(name, hand, starts, seed, lifted))))
+            lines.append((name, hand, *map(str, count_stages(name, hand, spec, starts, seed, lifted))))
             print("  ".join(lines[-1]), flush=True)
     print(f"\n{format_columns(lines, left={0, 1})}")
 
 
-def count_stages(name: str, hand_name: str, starts: int, seed: int, lifted: int) -> list[int | str]:
+def count_stages(name: str, hand_name: str, spec: ContactSpec, starts: int, seed: int, lifted: int) -> list[int | str]:
     """Return the numbers of one row: what every stage has left."""
     stages, hand, thing = dict[str, object](), load_hand(hand_name), load_object(name)
     note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
-    grasps = plan_grasps(thing.view, hand, SPEC, starts, seed, mode="paper", observer=note)
+    grasps = plan_grasps(thing.view, hand, spec, starts, seed, mode="paper", observer=note)
     seeds = stages["query"]
     assert isinstance(seeds, IKSeeds)
     lost = Counter(Status(int(code)) for code in grasps.status)
