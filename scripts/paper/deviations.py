@@ -36,6 +36,7 @@ from torchgrasp.data.shipped import GRASPED, load_shipped_grasp
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.protocols import draw_error, seed_of
+from torchgrasp.evaluation.score import most_certain_first
 from torchgrasp.files import format_json, write_file
 from torchgrasp.posture_model.mixture import PAPER_ENERGY, encode, load_mixture, mixture_path
 from torchgrasp.shape.conditioning import longest_distance
@@ -129,7 +130,7 @@ def of_lifts(count: int) -> Iterator[tuple[str, str]]:
             error = draw_error(PAPER, grasp, thing.mesh, seed_of(0, name, draw))
             found = close_hand(grasp, hand, thing.mesh, spec, draw + 1, parts=thing.parts, error=error)
             results.append(found)
-            first += found.contact_order[0] == int(grasp.contacts.require_std()[0].argmin())
+            first += most_certain_first(found.contact_order, grasp)
     closing = [float(x.phases[1] - x.phases[0]) for x in results]
     pushed = statistics.median(1e3 * x.pushed.distance for x in results)
     held, early = sum(x.held for x in results), sum(time < CLOSING_TIME - 0.05 for time in closing)

@@ -22,6 +22,7 @@ from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import PROTOCOLS, close_hand
 from torchgrasp.evaluation.protocols import draw_error, seed_of
+from torchgrasp.evaluation.score import most_certain_first
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -192,7 +193,7 @@ class _Bench:
         error = draw_error(PAPER, grasp, mesh, seed)
         touch = seed_of(seed, "touch")
         found = close_hand(grasp, self.hand, mesh, trial, touch, parts=parts, error=error)
-        certain = found.contact_order[0] == int(grasp.contacts.std_m[0].argmin()) if found.contact_order else None
+        certain = most_certain_first(found.contact_order, grasp) if found.contact_order else None
         return Lift(view, rank, draw, found.status, found.pushed.distance, found.slip.distance, certain)
 
 

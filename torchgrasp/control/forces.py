@@ -72,8 +72,7 @@ def squeeze(
     check_hand(hand, grasps)
     for name, x in named_tensors(grasps, "grasps.").items():
         check_dense(name, x, gradients=name == "grasps.joints")
-    hand = hand if hand.lower.dtype == torch.float64 else hand.to(torch.float64)  # a move copies all tables
-    hand, joints = settle(hand, grasps.joints.device), grasps.joints.double()
+    hand, joints = settle(hand.to(torch.float64), grasps.joints.device), grasps.joints.double()
     points, normals = contacts_in_hand(grasps)
     forces = desired_forces(points, normals, force)
     return press(joints, hand.jacobian(joints, points), forces, joint_stiffness(hand, kp))

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import Value, kept
-from torchgrasp.checks import Count, Range, checked
+from torchgrasp.checks import Count, Range, check_moved, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
@@ -96,7 +96,13 @@ class Hand(Value):
         return self.source.urdf_path
 
     def to(self, *args: Any, **kwargs: Any) -> "Hand":
-        """Return the hand on another device or in another floating dtype, with its chain; see `Value.to`."""
+        """Return the hand on another device or in another floating dtype, with its chain; see `Value.to`.
+
+        A hand that is there already is returned itself, without a copy of its chain.
+        """
+        check_moved(*args, **kwargs)
+        if self.lower.to(*args, **kwargs) is self.lower:
+            return self
         moved = super().to(*args, **kwargs)
         chain = copy.deepcopy(self.chain).to(dtype=moved.lower.dtype, device=moved.lower.device)
         return dataclasses.replace(moved, chain=chain)
