@@ -112,6 +112,7 @@ class ClosureResult(Value):
         object_motion: motion of the object in the hand from the pre-grasp to the end.
         pushed: motion of the object from the pre-grasp until all fingers touched, or the closing ended.
         before_lift: motion of the object from the start to the lift.
+        rise: height [m] by which the object's centre has risen at the end.
         unbalanced: norm of the sum of the fingertip forces before the lift, relative to the sum of their norms.
         slip: motion of the object in the hand after the hand has pressed.
         start_overlap: depth [m] by which the opened hand penetrates the object or the table at the start.
@@ -135,6 +136,7 @@ class ClosureResult(Value):
     object_motion: ObjectMotion
     pushed: ObjectMotion
     before_lift: ObjectMotion
+    rise: Measured
     unbalanced: Measured
     slip: ObjectMotion
     start_overlap: Measured

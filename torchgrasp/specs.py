@@ -157,11 +157,13 @@ class TrialSpec(Value):
         max_force: largest normal force [N] of a fingertip; None means no limit.
         mass: mass of the object [kg].
         friction: coefficient of friction of every contact.
+        table_friction: coefficient of friction between object and table; by default `friction`.
         gravity: gravity [m/s^2].
         approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts there.
         lift_height: height of the lift [m].
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
+        push: force [N] at the object's centre of mass during the hold, in the world's axes, whose z axis points up.
         force: desired normal force of the strongest finger [N].
         noise: whether the sensor is noisy; for a tactile sensor 0.1 N normal, 0.3 N tangential and 1.5 mm of position.
         timestep: timestep of the simulator [s].
@@ -205,6 +207,8 @@ class TrialSpec(Value):
     options: ClosingOptions | None = None
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
+    table_friction: Annotated[float, Range(0.0, 10.0)] | None = None
+    push: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Raise `BadArgument` if fields contradict each other."""
@@ -212,6 +216,10 @@ class TrialSpec(Value):
         check_modes(self.sensor, self.closing, self.holding)
         if self.max_force is not None and self.force > self.max_force:
             raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
+        if self.table_friction is not None and self.table_friction > self.friction:
+            raise BadArgument("table_friction", self.table_friction, f"at most friction, {self.friction:g}")
+        if not all(abs(x) <= 1000.0 for x in self.push):
+            raise BadArgument("push", self.push, "at most 1000 N along each axis")
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")

@@ -34,7 +34,7 @@ class Authored(TrialRun):
     lift (negative while the hand closes) and a height [m] of the hand.
     """
 
-    starts, felt = True, (0.0, 0.0)
+    starts, felt, slid = True, (0.0, 0.0), np.zeros(3)
 
     def __init__(self, motion, fingers=lambda time: 3, spec=None, touched=True, strained=False):
         self.spec = TrialSpec(hold_time=0.3) if spec is None else spec

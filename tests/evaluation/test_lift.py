@@ -38,7 +38,7 @@ def test_a_cylinder_is_held(name):
     assert result.held and result.status is Status.OK
     assert sorted(result.contact_order) == [0, 1, 2]
     rise = result.object_pose[-1, 2, 3] - result.object_pose[0, 2, 3]
-    assert float(rise) == pytest.approx(0.1, abs=0.01)
+    assert float(rise) == pytest.approx(0.1, abs=0.01) and result.rise == pytest.approx(float(rise), abs=0.005)
     assert result.object_motion.distance < 0.01 and result.object_motion.angle < 0.2
     assert float(result.forces[-25:].amax(-1).mean()) == pytest.approx(4.0, rel=0.15)
     assert len(result.time) == len(result.forces) == len(result.joints) == len(result.hand_pose)
@@ -274,3 +274,16 @@ def test_bad_arguments_are_refused():
     with pytest.raises(MeshError, match="parts"):
         close_hand(grasp, hand, mesh, parts=[])
     assert np.isfinite(mesh.vertices).all()
+
+
+def test_a_push_beyond_friction_takes_the_object_and_one_below_it_does_not():
+    """Three fingers press with at most 4 N each, so that friction of 0.8 holds less than 10 N along the cylinder."""
+    weak, strong = (close("allegro", spec=dataclasses.replace(QUICK, push=(0.0, 0.0, -push))) for push in (1.0, 30.0))
+    assert weak.held and not strong.held and strong.rise < 0.05
+
+
+def test_an_object_that_slides_during_the_approach_is_met_where_it_went():
+    result = close("allegro", spec=dataclasses.replace(QUICK, approach=0.1), slide=torch.tensor([0.0, 0.006, 0.0]))
+    moved = result.object_pose[:, :3, 3] - result.object_pose[0, :3, 3]
+    arrived = int((result.time < result.phases[0]).sum())
+    assert float(moved[arrived].norm()) == pytest.approx(0.006, abs=1e-3) and result.before_lift.distance < 0.03

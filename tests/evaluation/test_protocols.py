@@ -1,5 +1,6 @@
 """Where the hand and the object really stand: within the errors asked for, uniform, and the same for the same seed."""
 
+import dataclasses
 import math
 
 import pytest
@@ -15,6 +16,9 @@ from torchgrasp.evaluation.protocols import (
     draw_error,
     draw_hand_errors,
     draw_object_poses,
+    draw_push,
+    draw_slide,
+    find_protocol,
     error_from_object_pose,
     seed_of,
 )
@@ -79,3 +83,26 @@ def test_errors_of_any_dtype_and_device_move_the_hand_as_the_object_would_move(g
     assert torch.equal(apply_error(planned.float(), None), planned.float().double())
     with pytest.raises(BadArgument, match=r"error: expected .*got"):
         apply_error(planned, torch.full((4, 4), math.nan))
+
+
+def test_pushes_have_their_size_in_every_direction_and_slides_stay_on_the_table():
+    pushes = torch.tensor([draw_push(2.5, seed_of(0, k)) for k in range(600)], dtype=torch.float64)
+    near(pushes.norm(dim=-1), torch.full((600,), 2.5, dtype=torch.float64), 1e-12)
+    assert pushes.mean(0).norm() < 2.5 * 3 / math.sqrt(600)
+    assert draw_push(2.5, 1) == draw_push(2.5, 1)
+    slides = torch.stack([draw_slide(PoseNoise(0.03, 0.2), seed_of(0, k)) for k in range(300)])
+    assert bool((slides[:, 2] == 0).all()) and 0.028 < float(slides.abs().max()) <= 0.03
+
+
+def test_settings_of_lifts_and_pulls_do_not_mix():
+    lift, pull = find_protocol("table-lift"), find_protocol("dexgraspbench")
+    assert lift.trial.table_friction == 0.2 and lift.trial.friction == 0.8 and lift.criterion == "risen"
+    for bad in ({"push": 1.0}, {"criterion": "risen"}, {"displaced": "approach"}):
+        with pytest.raises(BadArgument, match="pull"):
+            dataclasses.replace(pull, **bad)
+    with pytest.raises(BadArgument, match="rotation"):
+        dataclasses.replace(lift, displaced="approach", noise=PoseNoise(0.0, 0.1))
+    with pytest.raises(BadArgument, match="table_friction"):
+        lift.with_trial(table_friction=0.9)
+    with pytest.raises(BadArgument, match="push"):
+        lift.with_trial(push=(0.0, 0.0, math.inf))

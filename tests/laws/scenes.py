@@ -34,6 +34,7 @@ def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
     * `rest`: an object on the table stays where it stands, and nothing is touched.
     * `fall`: without a table it falls by g t^2 / 2.
     * `pull`: a force at the mass centre of a weightless object moves it by F t^2 / (2 m) and turns it nowhere.
+    * `slide`: an object on the table slides only under a force beyond friction; `displace` moves the object.
     * `drive`: joints go to the targets of their drives.
     * `lift`, `approach`: the mount moves the hand along the world's z axis, and along the approach.
     * `overlap`: a hand that begins inside the object is told so.
@@ -44,6 +45,7 @@ def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
     law = _Laws(open_scene, _spec(hand), hand)
     law.check_start()
     law.check_object()
+    law.check_slide()
     law.check_hand()
     law.check_repeat()
 
@@ -120,6 +122,18 @@ class _Laws:
         moved = np.eye(4)
         moved[1, 3] = 0.5 * 0.2 * time * (time + self.spec.timestep)
         compare("pull", "the object", pulled.object_pose(), moved, MOVED)
+
+    def check_slide(self) -> None:
+        """Push the object along the table with forces just below and above friction."""
+        for share, time in ((0.9, 0.0), (1.3, 0.4)):
+            scene, weight = self.scene(table_friction=0.2), MASS * self.spec.gravity
+            scene.displace(np.array([0.04, -0.02, 0.0]))
+            top = np.array([0.0, HEIGHT / 2 * share * 0.2 * weight, 0.0])  # the force acts at the foot: nothing tips
+            scene.pull(np.array([share * 0.2 * weight, 0.0, 0.0]), -top)
+            for _ in range(STEPS):
+                scene.step()
+            moved = np.array([0.04 + 0.5 * (share - 1) * 0.2 * self.spec.gravity * time**2, -0.02, 0.0])
+            compare("slide", f"the object under {share:g} of friction", scene.object_pose()[:3, 3], moved, 2e-3)
 
     def check_hand(self) -> None:
         """Compare the hand's motion with what its motors were told."""

@@ -55,6 +55,7 @@ def close_hand(
     neighbours: Sequence[Neighbour] = (),
     told: Plane | None = None,
     surface: SignedDistanceField | None = None,
+    slide: Float[Tensor, "3"] | None = None,
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in simulation.
 
@@ -75,6 +76,7 @@ def close_hand(
         told: the table that the controller knows, in the grasp's frame; by default that of the plan (`Grasps.table`).
         surface: estimated surface of the object (`surface_field`), to estimate the object's pose from touches. Without
             it, only the tangent planes of the planned contacts are used.
+        slide: motion [m] of the object along the table, halfway through the approach, unknown to the controller.
 
     Raises:
         BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint limits; an approach
@@ -95,7 +97,8 @@ def close_hand(
     check_agreement("mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99)
     if table is not None:
         check_stand(mesh, table)
-    return lift_grasp(GraspTrial(hand, grasp, Truth(mesh, parts, error, table, neighbours), seed, told, surface), spec)
+    truth = Truth(mesh, parts, error, table, neighbours, slide)
+    return lift_grasp(GraspTrial(hand, grasp, truth, seed, told, surface), spec)
 
 
 @checked
@@ -191,6 +194,8 @@ class _Lift:
             self.unbalanced = run.robot.unbalanced()
             rising = run.robot.ticks(LIFT_TIME)
             for k in range(rising + run.robot.ticks(self.spec.hold_time)):
+                if k == rising and any(self.spec.push):
+                    run.scene.pull(np.array(self.spec.push))
                 run.scene.lift(*self._height((k + 1) * run.robot.period, rising * run.robot.period))
                 run.step()
                 self._record()
@@ -241,8 +246,9 @@ class _Lift:
             raise _ObjectLost
 
     def _moved(self) -> float:
-        """Return the distance [m] between the centres of mass of the object now and at the start of the trial."""
-        return float(torch.linalg.vector_norm(self.ticks[-1].centre - self.ticks[0].centre))
+        """Return how far [m] the object's centre of mass is from its place before the hand touched the object."""
+        start = self.ticks[0].centre + torch.from_numpy(self.run.slid)
+        return float(torch.linalg.vector_norm(self.ticks[-1].centre - start))
 
     def _all_touched(self) -> bool:
         """Return whether all fingers have touched the object, or the closing has ended."""
@@ -289,7 +295,7 @@ class _Lift:
             object_motion=self._motion(self.arrived, -1),
             pushed=self._motion(self.arrived, self.touched, in_hand=False),
             before_lift=self._motion(0, self.pressed, in_hand=False),
-            unbalanced=self.unbalanced, slip=self._motion(self.pressed, -1), start_overlap=self.run.overlap,
+            rise=float(ticks.centre[-1, 2] - ticks.centre[0, 2]), unbalanced=self.unbalanced, slip=self._motion(self.pressed, -1), start_overlap=self.run.overlap,
             disturbance=disturbance,
             trace=ClosingTrace(truth.forces, truth.points, truth.normals, truth.sliding, ticks.blend, *ticks.felt.T),
             phases=torch.tensor(reached, dtype=torch.float64),

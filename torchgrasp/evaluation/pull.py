@@ -13,7 +13,7 @@ from torchgrasp.checks import Measured, Range, checked
 from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.lift import run_lift
-from torchgrasp.evaluation.protocols import Protocol, PullSpec, find_protocol
+from torchgrasp.evaluation.protocols import Protocol, PullSpec, draw_push, find_protocol, seed_of
 from torchgrasp.evaluation.score import ProtocolResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.geometry.frames import rotation_angle
@@ -122,17 +122,24 @@ def run_protocol(
     rank: Annotated[int, Range(0, 1000000)] = 0,
     draw: Annotated[int, Range(0, 1000000)] = 0,
 ) -> ProtocolResult:
-    """Run one trial of a grasp, pulls or a lift; the result stores the grasp's `rank` and the pose error's `draw`."""
+    """Run one trial of a grasp, pulls or a lift; the result stores the grasp's `rank` and the pose error's `draw`.
+
+    A force of the size `protocol.push` in a direction drawn from the trial's seed pushes the lifted object.
+    """
     started = time.process_time()
+    if protocol.push:
+        protocol = protocol.with_trial(push=draw_push(protocol.push, seed_of(trial.seed, "push")))
     driver = TrialDriver(trial, protocol.trial)
     overlap = driver.grasp_overlap()
     if protocol.pull is not None:
         pull = run_pulls(driver, protocol.pull)
         status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
-        slip = ObjectMotion(math.nan, math.nan)
+        slip, passed = ObjectMotion(math.nan, math.nan), status is Status.OK
     else:
         lift = run_lift(driver)
         status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
         force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
+        passed = lift.held if protocol.criterion == "held" else lift.rise >= 0.5 * protocol.trial.lift_height
     spent = time.process_time() - started
-    return ProtocolResult(rank, draw, status is Status.OK, status, moved, turned, force, overlap, spent, *slip)
+    held = status is Status.OK
+    return ProtocolResult(rank, draw, passed, status, moved, turned, force, overlap, spent, *slip, held=held)

@@ -43,6 +43,7 @@ class ProtocolResult(Value):
         slip: motion of the object in the closed hand [m], in a lift.
         slip_angle: rotation of the object in the closed hand [rad], in a lift.
         predicted: predicted success of the grasp.
+        held: whether the status is `OK`: in a lift the object is then held without slip (`close_hand`).
     """
 
     rank: int
@@ -57,6 +58,7 @@ class ProtocolResult(Value):
     slip: Measured = math.nan
     slip_angle: Measured = math.nan
     predicted: Measured = math.nan
+    held: bool = False
 
 
 @checked

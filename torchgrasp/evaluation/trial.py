@@ -47,6 +47,7 @@ class Truth:
     error: Pose | None = None
     table: Plane | None = None
     neighbours: Sequence[Neighbour] = ()
+    slide: Float[Tensor, "3"] | None = None
 
 
 @checked
@@ -109,7 +110,7 @@ class TrialDriver:
         return SceneSpec(
             urdf_path=hand.urdf_path, world_from_hand=true_pose.numpy(), joints=_by_name(hand, grasp.pregrasp[0]),
             drives=drives, tip_links=tuple(hand.tips.links), mesh=body.mesh, parts=list(body.parts), mass=body.mass,
-            friction=spec.friction, gravity=spec.gravity, timestep=spec.timestep, travel=spec.lift_height,
+            friction=spec.friction, table_friction=spec.table_friction, gravity=spec.gravity, timestep=spec.timestep, travel=spec.lift_height,
             approach=tuple(approach.tolist()), table=spec.table, patch=spec.patch,
             height=None if truth.table is None else 0.0,
             neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in truth.neighbours),
@@ -159,12 +160,14 @@ class TrialRun:
         spec, trial = driver.spec, driver.trial
         self.spec, self.mass, self.obj_from_world = spec, driver.scene_spec.mass, driver.obj_from_world
         self.scene = open_scene(driver.scene_spec, spec.simulator)
+        slide = trial.truth.slide
+        self.slide = None if slide is None else (driver.obj_from_world[:3, :3].T @ slide.to("cpu", torch.float64)).numpy()
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
         reference = self.robot.reference
         guarded = spec.approach if spec.components.stops and can_guard(reference) else 0.0
         self.controller = GraspController(reference, spec.closing, spec.holding, spec.options, guarded)
-        self.overlap = self.scene.penetration()
+        self.overlap, self.slid = self.scene.penetration(), np.zeros(3)
 
     @property
     def starts(self) -> bool:
@@ -174,10 +177,12 @@ class TrialRun:
     def approach(self) -> Iterator[None]:
         """Move the opened hand straight to its pre-grasp; in a guarded approach, a touch stops the hand."""
         speed = 0.2  # mean speed [m/s] of an unguarded approach
+        half = 0.5 * self.spec.approach
         if self.controller.approaching:
             self.observation = self.robot.tick(self.controller.targets)
             yield
             while self.controller.approaching:
+                self._slide(self.controller.targets.left <= half)
                 self.step()
                 yield
             self.scene.approach(0.0)
@@ -186,9 +191,16 @@ class TrialRun:
         ticks = self.robot.ticks(length / speed) if length else 0
         for k in range(ticks):
             share, rate = smooth_step((k + 1) / ticks)
+            self._slide(share >= 0.5)
             self.scene.approach(length * (1 - share), length * rate / (ticks * self.robot.period))
             self.robot.tick(self.controller.targets)
             yield
+
+    def _slide(self, due: bool) -> None:
+        """Displace the object once, when it is due, if the truth says that the object moves during the approach."""
+        if due and self.slide is not None:
+            self.scene.displace(self.slide)
+            self.slid, self.slide = self.slide, None
 
     def close(self) -> Iterator[None]:
         """Close the fingers and press until the closing has ended."""

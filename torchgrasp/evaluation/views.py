@@ -11,7 +11,7 @@ from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.data import read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
-from torchgrasp.evaluation.protocols import Protocol, draw_error, seed_of
+from torchgrasp.evaluation.protocols import Protocol, draw_error, draw_slide, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.evaluation.trial import GraspTrial, Truth
@@ -167,10 +167,12 @@ def try_grasp(
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, *at)
     trial = protocol.trial
-    error, surface = draw_error(protocol, grasp, mesh, seed), None
+    during, surface = protocol.displaced == "approach", None
+    error = None if during else draw_error(protocol, grasp, mesh, seed)
+    slide = draw_slide(protocol.noise, seed) if during else None
     if trial.table and (trial.components.stops or trial.components.attempts > 1):
         surface = _fit_surface(view.objects, view.object, view.view)
-    attempt = GraspTrial(hand, grasp, Truth(mesh, parts, error), seed_of(seed, "touch"), surface=surface)
+    attempt = GraspTrial(hand, grasp, Truth(mesh, parts, error, slide=slide), seed_of(seed, "touch"), surface=surface)
     return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))
 
 

@@ -87,6 +87,12 @@ class MujocoScene(Scene):
         """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
         self.data.xfrc_applied[self.body] = [*force, *torque]
 
+    def displace(self, shift: np.ndarray) -> None:
+        """Move the object by a displacement (3,) [m]."""
+        start = self.model.joint(OBJECT).qposadr[0]
+        self.data.qpos[start : start + 3] += shift
+        self._mujoco.mj_step1(self.model, self.data)
+
     def joints(self) -> np.ndarray:
         """Return the position of every driven joint [rad]."""
         return self.data.qpos[self._positions]
@@ -146,7 +152,7 @@ def scene_mjcf(spec: SceneSpec) -> str:
     option = ET.SubElement(root, "option", OPTION, timestep=repr(spec.timestep), gravity=f"0 0 {-spec.gravity!r}")
     ET.SubElement(option, "flag", multiccd="enable", autoreset="disable")
     default = ET.SubElement(root, "default")
-    friction = format_numbers((spec.friction, spec.friction * spec.patch, 0.0))
+    friction, slick = (format_numbers((x, x * spec.patch, 0.0)) for x in (spec.friction, spec.slickness))
     condim = "4" if spec.patch > 0 else "3"
     ET.SubElement(default, "geom", friction=friction, condim=condim, solref=SOLREF, solimp=SOLIMP)
     ET.SubElement(default, "joint", solreflimit=SOLREF)
@@ -155,10 +161,10 @@ def scene_mjcf(spec: SceneSpec) -> str:
     if spec.table:
         bits = _bits(TABLE_BIT, HAND_BIT)
         height = format_numbers((0.0, 0.0, spec.table_height))
-        ET.SubElement(world, "geom", bits, name=TABLE, type="plane", size="1 1 0.1", pos=height)
-    _add_body(asset, world, OBJECT, spec.body, HAND_BIT | TABLE_BIT)
+        ET.SubElement(world, "geom", bits, name=TABLE, type="plane", size="1 1 0.1", pos=height, friction=slick)
+    _add_body(asset, world, OBJECT, spec.body, HAND_BIT | TABLE_BIT, slick)
     for k, body in enumerate(spec.neighbours):
-        _add_body(asset, world, NEIGHBOUR.format(k), body, HAND_BIT | TABLE_BIT | OBJECT_BIT)
+        _add_body(asset, world, NEIGHBOUR.format(k), body, HAND_BIT | TABLE_BIT | OBJECT_BIT, slick)
     _add_hand(world, spec, urdf)
     for name in movable:
         add_drive(actuator, name, spec.drives[name])
@@ -167,15 +173,18 @@ def scene_mjcf(spec: SceneSpec) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def _add_body(asset: ET.Element, world: ET.Element, name: str, spec: Body, hits: int) -> None:
-    """Add a free body of uniform density; `hits` are the bits of the collision groups with which it collides."""
+def _add_body(asset: ET.Element, world: ET.Element, name: str, spec: Body, hits: int, friction: str) -> None:
+    """Add a free body of uniform density; `hits` are the bits of the collision groups with which it collides.
+
+    A contact has the larger friction of its two bodies, so that a slick body sticks to the hand but not to the table.
+    """
     body = ET.SubElement(world, "body", name=name)
     ET.SubElement(body, "freejoint", name=name)
     _weigh(body, spec.mass, spec.mesh.center_mass, spec.inertia[np.triu_indices(3)])
     for k, part in enumerate(spec.parts):
         corners = format_numbers(np.asarray(part.vertices, float).ravel())
         ET.SubElement(asset, "mesh", name=f"{name}_{k}", vertex=corners)
-        ET.SubElement(body, "geom", _bits(OBJECT_BIT, hits), type="mesh", mesh=f"{name}_{k}")
+        ET.SubElement(body, "geom", _bits(OBJECT_BIT, hits), type="mesh", mesh=f"{name}_{k}", friction=friction)
 
 
 def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:

@@ -132,14 +132,16 @@ class SapienScene(Scene):
         super().__init__(spec)
         sapien, physx = import_sapien()
         self.system, self.scene = open_world(sapien, physx, spec.gravity, spec.timestep)
-        material = physx.PhysxMaterial(spec.friction, spec.friction, 0.0)
+        slick = physx.PhysxMaterial(spec.slickness, spec.slickness, 0.0)
+        both = 2 * spec.friction - spec.slickness  # PhysX averages the coefficients of two bodies
+        grip = physx.PhysxMaterial(both, both, 0.0)
         if spec.table:
-            place(sapien, self.scene, "table", table(physx, material), spec.table_height - TABLE[2] / 2)
-        bodies = [rigid_body(sapien, physx, material, body, spec.patch) for body in (spec.body, *spec.neighbours)]
+            place(sapien, self.scene, "table", table(physx, slick), spec.table_height - TABLE[2] / 2)
+        bodies = [rigid_body(sapien, physx, slick, body, spec.patch) for body in (spec.body, *spec.neighbours)]
         for k, body in enumerate(bodies):
             place(sapien, self.scene, "neighbour" if k else "object", body)
         self.body, *self.neighbours = bodies
-        self.hand = _hand(self.scene, material, spec)
+        self.hand = _hand(self.scene, grip, spec)
         links = {link.name: link for link in self.hand.links}
         self.tips = [links[name] for name in spec.tip_links]
         self.root = next(j.child_link for j in self.hand.joints if j.name == WRIST_JOINT)
@@ -197,6 +199,12 @@ class SapienScene(Scene):
         """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
         self._force, self._torque = np.asarray(force, np.float32), np.asarray(torque, np.float32)
         self._pulled = bool(self._force.any() or self._torque.any())
+
+    def displace(self, shift: np.ndarray) -> None:
+        """Move the object by a displacement (3,) [m]."""
+        sapien, _ = import_sapien()
+        pose = self.body.entity_pose
+        self.body.entity.set_pose(sapien.Pose(pose.p + shift, pose.q))
 
     def joints(self) -> np.ndarray:
         """Return the position of every driven joint [rad]."""

@@ -125,6 +125,10 @@ class Scene(abc.ABC):
         """Apply a force [N] at the object's mass centre and a torque [N m], in this and all later steps."""
 
     @abc.abstractmethod
+    def displace(self, shift: np.ndarray) -> None:
+        """Move the object by a displacement (3,) [m], as a person who pushes the object while the hand approaches."""
+
+    @abc.abstractmethod
     def joints(self) -> np.ndarray:
         """Return the position of every driven joint [rad]."""
 

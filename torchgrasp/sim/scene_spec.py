@@ -76,6 +76,7 @@ class SceneSpec:
         parts: convex bodies that make up the object.
         mass: mass of the object [kg].
         friction: friction coefficient of every contact.
+        table_friction: friction coefficient of bodies with the table and each other; by default `friction`.
         gravity: gravity [m/s^2].
         timestep: timestep of the simulator [s].
         travel: largest height [m] of a lift.
@@ -107,6 +108,7 @@ class SceneSpec:
     neighbours: tuple[Body, ...] = ()
     self_pairs: tuple[tuple[str, str], ...] = ()
     yields: float = 0.0
+    table_friction: float | None = None
 
     @functools.cached_property
     def urdf(self) -> Urdf:
@@ -131,6 +133,11 @@ class SceneSpec:
     def body(self) -> Body:
         """The object to grasp as a rigid body: its mesh, convex parts and mass."""
         return Body(self.mesh, self.parts, self.mass)
+
+    @property
+    def slickness(self) -> float:
+        """The friction coefficient of bodies with the table and each other."""
+        return self.friction if self.table_friction is None else self.table_friction
 
     @property
     def table_height(self) -> float:

@@ -60,6 +60,7 @@ def run() -> Run:
         object_motion=ObjectMotion(0.003, math.radians(2)),
         pushed=ObjectMotion(0.002, 0.0),
         before_lift=ObjectMotion(0.002, 0.0),
+        rise=0.1,
         unbalanced=0.1,
         slip=ObjectMotion(0.001, 0.0),
         start_overlap=0.0,

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from torchgrasp import evaluation
 from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, STARTS_HELP, import_simulator, load_fingers
 from torchgrasp.app.report.evaluation import SHARE_NAMES, list_figures, write_evaluation
@@ -23,7 +24,9 @@ from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
 
 OBJECTS_HELP = "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
 PROTOCOL_HELP = "the test that decides on success; see torchgrasp.evaluation.protocols"
-Protocol = Literal["multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop", "household"]
+Protocol = Literal[
+    "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop", "household", "table-lift"
+]  # fmt: skip
 
 
 @arguments(folder="out", path="out")
@@ -61,15 +64,27 @@ class Evaluate(_Trials):
     protocol: Protocol = option("dexgraspbench", PROTOCOL_HELP)
     holding: HoldingMode = option("force", "how the hand presses after closing")
     force: float | None = option(None, "normal force of the strongest finger [N]; by default as the protocol says")
+    displaced: float = option(0.0, "lifts: most that the object is displaced along each axis of the table [m]")
+    during: bool = option(False, "displace the object halfway through the approach, not before it")
+    push: float = option(0.0, "lifts: size of a force in a random direction on the lifted object [N]")
+    draws: Count = option(1, "trials of each grasp, with other displacements, pushes and sensor noise")
     complete: bool = option(False, "plan on the whole cloud instead of each view")
     planned: Path | None = option(None, 'folder "grasps" of an earlier run, whose grasps are tested')
     workers: int = option(1, "processes; the results do not depend on their number")
+
+    def disturbed(self, test: evaluation.Protocol) -> evaluation.Protocol:
+        """Return a protocol with the displacements, pushes and draws that the user set."""
+        noise = {"translation": self.displaced, "rotation": 0.0} if self.displaced else {}
+        noise = dataclasses.replace(test.noise, **noise | ({"draws": self.draws} if self.draws > 1 else {}))
+        changes = {"displaced": "approach"} if self.during else {}
+        return dataclasses.replace(test, noise=noise, push=self.push or test.push, **changes)
 
     def run(self) -> int:
         """Evaluate the objects, write the results and print the summary; return the exit code."""
         import_simulator(self.simulator)
         hand, among = load_fingers(self.hand, self.fingers)
-        test = find_protocol(self.protocol).with_trial(**self.trial(force=self.force, holding=self.holding))
+        test = self.disturbed(find_protocol(self.protocol))
+        test = test.with_trial(**self.trial(force=self.force, holding=self.holding))
         spec = EvaluationSpec(
             self.grasps, self.ranks, self.starts, self.complete, self.only, self.planned is not None, self.seed,
             self.views, among,
@@ -110,7 +125,7 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
 
 def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
     """Print one line with the result of a view; `widths` are the column widths of the names of object and view."""
-    failed = [attempt.status for attempt in score.attempts if attempt.status is not Status.OK]
+    failed = [attempt.status for attempt in score.attempts if not attempt.passed]
     reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
     passed = f"{sum(attempt.passed for attempt in score.attempts)}/{len(score.attempts)}"
