@@ -18,8 +18,8 @@ from torchgrasp.evaluation.protocols import (
     draw_object_poses,
     draw_push,
     draw_slide,
-    find_protocol,
     error_from_object_pose,
+    find_protocol,
     seed_of,
 )
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector

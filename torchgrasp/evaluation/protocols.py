@@ -111,7 +111,9 @@ PROTOCOLS = {
         Protocol("paper", TrialSpec(), noise=POSE_NOISE),
         Protocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
         Protocol("household", TrialSpec(shake=0.003, force=6.0)),
-        Protocol("table-lift", TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.2, force=6.0), criterion="risen"),
+        Protocol(
+            "table-lift", TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.2, force=6.0), criterion="risen"
+        ),
     )
 }
 """The protocols by name.

@@ -110,7 +110,8 @@ class TrialDriver:
         return SceneSpec(
             urdf_path=hand.urdf_path, world_from_hand=true_pose.numpy(), joints=_by_name(hand, grasp.pregrasp[0]),
             drives=drives, tip_links=tuple(hand.tips.links), mesh=body.mesh, parts=list(body.parts), mass=body.mass,
-            friction=spec.friction, table_friction=spec.table_friction, gravity=spec.gravity, timestep=spec.timestep, travel=spec.lift_height,
+            friction=spec.friction, table_friction=spec.table_friction, gravity=spec.gravity,
+            timestep=spec.timestep, travel=spec.lift_height,
             approach=tuple(approach.tolist()), table=spec.table, patch=spec.patch,
             height=None if truth.table is None else 0.0,
             neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in truth.neighbours),
@@ -161,7 +162,9 @@ class TrialRun:
         self.spec, self.mass, self.obj_from_world = spec, driver.scene_spec.mass, driver.obj_from_world
         self.scene = open_scene(driver.scene_spec, spec.simulator)
         slide = trial.truth.slide
-        self.slide = None if slide is None else (driver.obj_from_world[:3, :3].T @ slide.to("cpu", torch.float64)).numpy()
+        self.slide = (
+            None if slide is None else (driver.obj_from_world[:3, :3].T @ slide.to("cpu", torch.float64)).numpy()
+        )
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
         reference = self.robot.reference
