@@ -128,7 +128,10 @@ def hints_of(thing):
     return typing.get_type_hints(inspect.unwrap(getattr(thing, "__func__", thing)), scope)
 
 
-TAKERS = (derive_reference, ClosingReference.from_grasp, GraspController.__init__, GraspController.step, plan_grasps)
+TAKERS = (
+    *(derive_reference, ClosingReference.from_grasp, plan_grasps),
+    *(GraspController.__init__, GraspController.step, GraspController.relook),
+)
 
 
 @pytest.mark.parametrize("taker", TAKERS)

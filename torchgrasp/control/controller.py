@@ -1,5 +1,6 @@
 """The grasp controller: approach that stops at a touch, closing of the fingers, and hold. It needs no simulator."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Annotated
@@ -16,11 +17,14 @@ from torchgrasp.control.paper.closings import Impedance, OpenLoopClosing, PaperC
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.control.recovery import PRESSING_TIME, GraspCheck, GuardedApproach, Reopening, can_guard
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.tactile import Observation, Targets
+from torchgrasp.control.relook import relocate
+from torchgrasp.control.tactile import STILL, Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.geometry.frames import apply, inverse, rigid
 from torchgrasp.hand.hand import Hand
 from torchgrasp.specs import ClosingMode, HoldingMode, check_modes
+from torchgrasp.values import PointCloud
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Function of an observation and the time [s] to the next tick, which returns the targets [rad] of all joints."""
@@ -41,7 +45,7 @@ class GraspController:
 
     With `approach` > 0 the opened hand starts away from its pre-grasp, the pose from which the fingers close. While
     `approaching`, a robot arm must keep the hand at the distance `Targets.left` from the pre-grasp; `stops` counts the
-    stops at an unexpected touch.
+    stops at an unexpected touch. A new view of the object (`relook`) moves this path.
 
     Args:
         reference: the closing plan.
@@ -78,13 +82,19 @@ class GraspController:
         if approach and not (self.options.stops and can_guard(reference)):
             allowed = "0 without stops, or without a table, a surface and a direction in the reference"
             raise BadArgument("approach", approach, allowed)
-        self.reference = reference = settle(reference, torch.device("cpu"))
-        self.guard = GuardedApproach(reference, self.options, approach) if approach else None
-        self._make_closing = functools.partial(make_closing, reference, closing, self.options)
         self._make_hold = choose_holding(reference.hand, holding)
-        self.attempts, self.stops = 0, 0
+        self.mode: ClosingMode = closing
+        self.path = STILL  # displacement [m] of the palm's path by a new view
+        self.planned = settle(reference, torch.device("cpu"))
+        self._prepare(self.planned, approach)
+
+    def _prepare(self, reference: ClosingReference, approach: float) -> None:
+        """Begin with a plan: first its approach, if there is one, and then its closing."""
+        self.reference, self.attempts, self.stops = reference, 0, 0
+        self.guard = GuardedApproach(reference, self.options, approach) if approach else None
+        self._make_closing = functools.partial(make_closing, reference, self.mode, self.options)
         self._begin(self._make_closing())
-        self.targets = Targets(reference.expand(reference.pregrasp), left=approach)
+        self.targets = Targets(reference.expand(reference.pregrasp), self.path, approach)
 
     def _begin(self, closing: Closing) -> None:
         """Start a new attempt to close the hand, controlled by `closing`, and count it."""
@@ -121,6 +131,30 @@ class GraspController:
         return torch.full_like(self.reference.normals[:, 0], torch.nan)
 
     @checked
+    def relook(self, cloud: PointCloud) -> None:
+        """Move the palm's path to where a new view shows the object; `targets.palm` is then where the path begins.
+
+        The palm does not rotate, so the contacts of a turned object are found by touch.
+
+        Args:
+            cloud: points [m] of the object alone, in the frame of the grasp.
+
+        Raises:
+            BadArgument: the hand has no approach, or has begun it.
+        """
+        reference = self.planned
+        if self.guard is None or self.guard.left < self.guard.length:
+            raise BadArgument("cloud", "a view of the object after the start of the approach", "one before it")
+        assert reference.surface is not None and reference.table is not None
+        moved = relocate(reference.surface, cloud, reference.table.moved(reference.obj_from_hand))
+        in_hand = inverse(reference.obj_from_hand) @ moved @ reference.obj_from_hand
+        centre = reference.gains.target.mean(0)
+        self.path = apply(in_hand, centre[None])[0] - centre
+        shifted = rigid(torch.eye(3, dtype=torch.float64), self.path)
+        pose = reference.obj_from_hand @ inverse(in_hand) @ shifted
+        self._prepare(dataclasses.replace(reference, obj_from_hand=pose), self.guard.length)
+
+    @checked
     def step(self, observation: Observation, period: Period) -> Targets:
         """Return the targets of joints and palm for the next tick, which comes `period` [s] later.
 
@@ -139,7 +173,7 @@ class GraspController:
         elif self.reopening is not None:
             self.targets = self._reopen(self.reopening, period)
         else:
-            self.targets = Targets(self._close_or_hold(observation, period), self.closing.palm)
+            self.targets = Targets(self._close_or_hold(observation, period), self.path + self.closing.palm)
             self._judge(observation)
         return self.targets
 
@@ -150,7 +184,7 @@ class GraspController:
             self.guard, self.stops = None, guard.stops
             if self.stops and isinstance(self.closing, UncertaintyClosing):
                 self.closing.begin_at(guard.displacement, guard.palm)
-        return Targets(self.targets.joints, guard.palm, guard.left)
+        return Targets(self.targets.joints, self.path + guard.palm, guard.left)
 
     def _close_or_hold(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the joint targets of the closing controller, or of the hold controller once closing has ended."""
@@ -178,13 +212,13 @@ class GraspController:
             return
         self.check(observation, self.pressed)
         if self.check.judged and not self.check.secure:
-            reach, targets = self.options.palm_reach, self.targets
-            self.reopening = Reopening(self.reference, self.check.displacement, targets.joints, targets.palm, reach)
+            reach, joints = self.options.palm_reach, self.targets.joints
+            self.reopening = Reopening(self.reference, self.check.displacement, joints, self.closing.palm, reach)
             self.hold, self.check, self.pressed = None, None, 0.0
 
     def _reopen(self, reopening: Reopening, period: float) -> Targets:
         """Return the targets of the opening hand; once it is open, start the next closing."""
-        targets = Targets(reopening(period), reopening.palm)
+        targets = Targets(reopening(period), self.path + reopening.palm)
         if reopening.done:
             closing = self._make_closing()
             assert isinstance(closing, UncertaintyClosing)

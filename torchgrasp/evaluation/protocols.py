@@ -56,6 +56,7 @@ class Protocol(Value):
         criterion: a lift passes if the object is "held" (`close_hand`), or has "risen" by half of the lift at the end.
         displaced: when the object of a lift is displaced: "before" the approach, or halfway through the "approach".
         push: size of a force [N] in a random direction at the lifted object.
+        relook: whether the camera looks at the object of a lift once more, from the same place, before the approach.
 
     Raises:
         BadArgument: a rotation during the approach, or a push or a displacement in a protocol of pulls.
@@ -68,14 +69,15 @@ class Protocol(Value):
     criterion: Literal["held", "risen"] = "held"
     displaced: Literal["before", "approach"] = "before"
     push: Annotated[float, Range(0.0, 1000.0)] = 0.0
+    relook: bool = False
 
     def __post_init__(self) -> None:
         """Raise `BadArgument` if fields contradict each other."""
         if self.displaced == "approach" and self.noise.rotation:
             raise BadArgument("noise.rotation", self.noise.rotation, "0 for an object displaced during the approach")
-        lifts = self.criterion, self.displaced, self.push
-        if self.pull is not None and lifts != ("held", "before", 0.0):
-            raise BadArgument("pull", "a pull with a criterion, displacement or push of a lift", "None")
+        lifts = self.criterion, self.displaced, self.push, self.relook
+        if self.pull is not None and lifts != ("held", "before", 0.0, False):
+            raise BadArgument("pull", "a pull with a criterion, displacement, push or second look of a lift", "None")
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":

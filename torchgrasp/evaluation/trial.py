@@ -13,13 +13,15 @@ from torch import Tensor
 
 from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.closure import SensorModel
+from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding import GripHold
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
+from torchgrasp.control.relook import REACH
 from torchgrasp.errors import BadArgument
-from torchgrasp.evaluation.protocols import apply_error
+from torchgrasp.evaluation.protocols import apply_error, seed_of
 from torchgrasp.geometry.frames import inverse, rigid
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import GRID, Plane, to_upright
@@ -40,7 +42,11 @@ if TYPE_CHECKING:
 @checked
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """The true world of a trial, which only the simulator gets; the fields are arguments of `close_hand`."""
+    """The true world of a trial, which only the simulator gets; the fields are arguments of `close_hand`.
+
+    The object slides by `slide` [m] halfway through the approach. `camera` is the pose, in the frame of the grasp, of a
+    depth camera that looks at the object once more before the hand comes to its approach.
+    """
 
     mesh: "trimesh.Trimesh | Path | str"
     parts: "Sequence[trimesh.Trimesh] | None" = None
@@ -48,6 +54,7 @@ class Truth:
     table: Plane | None = None
     neighbours: Sequence[Neighbour] = ()
     slide: Float[Tensor, "3"] | None = None
+    camera: Pose | None = None
 
 
 @checked
@@ -115,7 +122,8 @@ class TrialDriver:
             approach=tuple(approach.tolist()), table=spec.table, patch=spec.patch,
             height=None if truth.table is None else 0.0,
             neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in truth.neighbours),
-            self_pairs=hand.self_pairs if spec.self_collision else (), yields=spec.components.palm_reach,
+            self_pairs=hand.self_pairs if spec.self_collision else (),
+            yields=spec.components.palm_reach + (0.0 if truth.camera is None else 1.5 * REACH),
         )  # fmt: skip
 
     def _body(self, given: "Solid", parts: "Sequence[trimesh.Trimesh] | None", mass: float | None = None) -> Body:
@@ -160,17 +168,27 @@ class TrialRun:
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial
         self.spec, self.mass, self.obj_from_world = spec, driver.scene_spec.mass, driver.obj_from_world
-        self.scene = open_scene(driver.scene_spec, spec.simulator)
         slide = trial.truth.slide
         self.slide = (
             None if slide is None else (driver.obj_from_world[:3, :3].T @ slide.to("cpu", torch.float64)).numpy()
         )
+        guarded = spec.approach if spec.components.stops and can_guard(driver.reference) else 0.0
+        self.controller = GraspController(driver.reference, spec.closing, spec.holding, spec.options, guarded)
+        scene_spec = driver.scene_spec if trial.truth.camera is None else self._relook(driver, trial.truth.camera)
+        self.scene = open_scene(scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
-        self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
-        reference = self.robot.reference
-        guarded = spec.approach if spec.components.stops and can_guard(reference) else 0.0
-        self.controller = GraspController(reference, spec.closing, spec.holding, spec.options, guarded)
+        palm = self.controller.targets.palm
+        self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator, palm)
         self.overlap, self.slid = self.scene.penetration(), np.zeros(3)
+
+    def _relook(self, driver: TrialDriver, camera: Float[Tensor, "4 4"]) -> SceneSpec:
+        """Show the controller what a camera sees; return the scene with the hand at the new start of its path."""
+        seen_from, scene_spec = driver.reference.obj_from_hand.numpy(), driver.scene_spec
+        mesh = scene_spec.mesh.copy()
+        mesh.apply_transform(seen_from @ np.linalg.inv(scene_spec.world_from_hand))  # the robot takes its pose for true
+        self.controller.relook(partial_view(mesh, camera, seed=seed_of(driver.trial.seed, "relook")))
+        start = scene_spec.world_from_hand[:3, :3] @ self.controller.targets.palm.numpy()
+        return dataclasses.replace(scene_spec, start=tuple(start.tolist()))
 
     @property
     def starts(self) -> bool:

@@ -2,13 +2,18 @@
 
 import dataclasses
 import functools
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from jaxtyping import Float
+from torch import Tensor
+
 from torchgrasp.base import Value, count_status
 from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.cloud.agreement import check_mesh, check_stand
+from torchgrasp.cloud.camera import look_at
 from torchgrasp.data import read_entry, read_object_mesh, read_view
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.protocols import Protocol, draw_error, draw_slide, seed_of
@@ -172,8 +177,20 @@ def try_grasp(
     slide = draw_slide(protocol.noise, seed) if during else None
     if trial.table and (trial.components.stops or trial.components.attempts > 1):
         surface = _fit_surface(view.objects, view.object, view.view)
-    attempt = GraspTrial(hand, grasp, Truth(mesh, parts, error, slide=slide), seed_of(seed, "touch"), surface=surface)
+    camera = _camera_of(read_view(view.objects, view.object, view.view)) if protocol.relook else None
+    truth = Truth(mesh, parts, error, slide=slide, camera=camera)
+    attempt = GraspTrial(hand, grasp, truth, seed_of(seed, "touch"), surface=surface)
     return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))
+
+
+def _camera_of(cloud: PointCloud) -> Float[Tensor, "4 4"]:
+    """Return the pose of a camera at the viewpoint of a cloud that looks at the cloud."""
+    if cloud.viewpoint is None:
+        raise BadArgument("relook", "a view without the camera's position", "views with a viewpoint")
+    middle = cloud.points.double().mean(0)
+    x, y, z = (cloud.viewpoint.double().reshape(-1, 3)[0] - middle).tolist()
+    azimuth, elevation = math.atan2(y, x), math.atan2(z, math.hypot(x, y))
+    return look_at(math.degrees(azimuth), math.degrees(elevation), math.hypot(x, y, z), middle)
 
 
 @functools.lru_cache(maxsize=2)

@@ -87,6 +87,7 @@ class SceneSpec:
         neighbours: other bodies on the table.
         self_pairs: pairs of the hand's links that collide with each other.
         yields: largest displacement [m] of the mount along each axis of the world; 0 if the mount is stiff.
+        start: displacement [m] of a mount that yields at the beginning.
     """
 
     urdf_path: Path | str
@@ -108,6 +109,7 @@ class SceneSpec:
     neighbours: tuple[Body, ...] = ()
     self_pairs: tuple[tuple[str, str], ...] = ()
     yields: float = 0.0
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     table_friction: float | None = None
 
     @functools.cached_property
@@ -126,7 +128,8 @@ class SceneSpec:
             slides.append(Slide(APPROACH_JOINT, axis, -length - 0.01, 0.01, -length))
         if self.yields > 0:
             most, axes = self.yields + 0.01, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-            slides += [Slide(name, axis, -most, most, 0.0) for name, axis in zip(SHIFT_JOINTS, axes, strict=True)]
+            each = zip(SHIFT_JOINTS, axes, self.start, strict=True)
+            slides += [Slide(name, axis, -most, most, start) for name, axis, start in each]
         return slides
 
     @property

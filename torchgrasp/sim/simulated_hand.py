@@ -8,6 +8,7 @@ import torch
 
 from torchgrasp.checks import Range, checked
 from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
+from torchgrasp.control.tactile import STILL
 from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene import Scene, StepContacts
 from torchgrasp.sim.scene_spec import SceneSpec
@@ -54,10 +55,16 @@ class SimulatedHand:
         reference: the closing plan.
         control_rate: rate of control ticks [Hz].
         generator: draws the noise of the fingertips; without one there is no noise.
+        palm: displacement of the palm [m] at which the scene begins.
     """
 
     def __init__(
-        self, scene: Scene, reference: ClosingReference, control_rate: float, generator: torch.Generator | None
+        self,
+        scene: Scene,
+        reference: ClosingReference,
+        control_rate: float,
+        generator: torch.Generator | None,
+        palm: torch.Tensor = STILL,
     ) -> None:
         self.scene, self.reference = scene, reference
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
@@ -65,7 +72,7 @@ class SimulatedHand:
         fingers = len(reference.hand.tips)
         self.steps, self.first_touch = 0, [float("inf")] * fingers
         self.first_stray, self.stray, self.most_stray = np.full(3, np.inf), np.zeros(3), np.zeros(3)
-        self._palm, self.pushes = np.zeros(3), np.zeros((fingers, 3))
+        self._palm, self.pushes = palm.numpy(), np.zeros((fingers, 3))
         self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
         self.sensor = FingertipSensor(reference, generator)
         nothing = torch.full((fingers, 3), torch.nan, dtype=torch.float64)

@@ -66,6 +66,7 @@ class Evaluate(_Trials):
     force: float | None = option(None, "normal force of the strongest finger [N]; by default as the protocol says")
     displaced: float = option(0.0, "lifts: most that the object is displaced along each axis of the table [m]")
     during: bool = option(False, "displace the object halfway through the approach, not before it")
+    relook: bool = option(False, "lifts: a camera looks at the displaced object once more, before the approach")
     push: float = option(0.0, "lifts: size of a force in a random direction on the lifted object [N]")
     draws: Count = option(1, "trials of each grasp, with other displacements, pushes and sensor noise")
     complete: bool = option(False, "plan on the whole cloud instead of each view")
@@ -77,6 +78,7 @@ class Evaluate(_Trials):
         noise = {"translation": self.displaced, "rotation": 0.0} if self.displaced else {}
         noise = dataclasses.replace(test.noise, **noise | ({"draws": self.draws} if self.draws > 1 else {}))
         changes = {"displaced": "approach"} if self.during else {}
+        changes |= {"relook": True} if self.relook else {}
         return dataclasses.replace(test, noise=noise, push=self.push or test.push, **changes)
 
     def run(self) -> int:
