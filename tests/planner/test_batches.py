@@ -87,6 +87,24 @@ def test_an_observer_hears_of_each_batch_and_of_the_stages_of_all(whole):
     assert sum(len(batch) for batch in batches) < len(grasps) and len(batches[0]) <= FIRST
 
 
+def test_without_a_grasp_contacts_are_planned_on_smaller_flat_areas():
+    plans = []
+
+    def note(stage, text, value):
+        plans.extend([value] * (stage == "plan"))
+
+    def none_on_the_widest(poses):
+        return torch.full((len(poses),), len(plans) > 1)
+
+    options = {"starts": 8, "observer": note}
+    found = plan_grasps(VIEW, HAND, SPEC, reachable=none_on_the_widest, **options)
+    widest, narrower = plans
+    assert not same_bits(widest, narrower)
+    given = dataclasses.replace(SPEC, flat_radius=0.006)
+    assert same_bits(found, plan_grasps(VIEW, HAND, given, reachable=none_on_the_widest, **options))
+    assert len(plans) == 3 and bool((found.status == Status.OK).any())
+
+
 def test_batches_plan_all_starts_and_try_all_rows():
     for starts in [*range(1, 300), 1000, 10_000]:
         for most in (160, 250):

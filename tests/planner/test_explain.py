@@ -148,7 +148,8 @@ def test_a_disc_too_low_needs_its_table_gone_and_an_object_under_another_the_oth
 
 def test_fingers_without_a_thumb_are_told_to_take_it(monkeypatch):
     monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 2)
-    explanation = explain_empty(VIEW, load_hand("allegro", "paper_literal"), TABLE, starts=8)
+    spec = dataclasses.replace(TABLE, flat_radius=0.008)
+    explanation = explain_empty(VIEW, load_hand("allegro", "paper_literal"), spec, starts=8)
     assert explanation.funnel.executable == 0 and explanation.best is not None
     assert "fingers='default' (index, middle, thumb)" in explanation.best.words and explanation.best.choice
     assert str(explanation.best) in str(explanation) and "tip_error" in str(explanation)

@@ -18,7 +18,7 @@ from torchgrasp.files import temporary_folder
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_tasks
-from torchgrasp.planner.batches import Planner, describe, rank_together
+from torchgrasp.planner.batches import describe, plan_hand, rank_together
 from torchgrasp.planner.problem import Budget, PlanOptions, Problem, Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
@@ -181,7 +181,7 @@ def _plan_batches(request: Request) -> Iterator[Grasps]:
     hands = request.hands
     problem = Problem.of(request, hands[0])
     if len(hands) == 1:
-        for grasps in Planner(problem).run(deadline):
+        for grasps in plan_hand(problem, deadline):
             yield problem.give_back(grasps)
     else:
         yield _plan_sets(problem, hands, deadline)
@@ -198,7 +198,7 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
         stages = list[tuple[str, str, Any]]()
         own = problem.for_hand(hand, lambda *stage: stages.append(stage))  # noqa: B023 called at once
         now = time.monotonic()
-        batches = list(Planner(own).run(now + (deadline - now) / left))
+        batches = list(plan_hand(own, now + (deadline - now) / left))
         grasps = own.give_back(rank_together(batches, problem.request.order))
         expected, count = expected_success(grasps), int((grasps.status == Status.OK).sum())
         observer("fingers", f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected", grasps)
