@@ -196,16 +196,21 @@ class _Lift:
             for k in range(rising + run.robot.ticks(self.spec.hold_time)):
                 if k == rising and any(self.spec.push):
                     run.scene.pull(np.array(self.spec.push))
-                run.scene.lift(*self._height((k + 1) * run.robot.period, rising * run.robot.period))
+                at = (k + 1) * run.robot.period, rising * run.robot.period
+                run.scene.lift(*self._height(*at))
                 run.step()
                 self._record()
-                if run.controller.status is Status.TOO_HEAVY:
-                    return self._put_down((k + 1) * run.robot.period, rising * run.robot.period)
+                if self._gives_up(self._height(*at)[0]):
+                    return self._put_down(*at)
         except FloatingPointError:
             return Status.UNSTABLE
         except _ObjectLost:
             pass
         return self._verdict()
+
+    def _gives_up(self, height: float) -> bool:
+        """Return whether the hand, raised to a height [m], shall put the object down."""
+        return self.run.controller.status is Status.TOO_HEAVY
 
     def _put_down(self, time: float, rising: float) -> Status:
         """Lower the hand for as long as it rose; return `TOO_HEAVY`, or `DROPPED` if the object is then elsewhere."""

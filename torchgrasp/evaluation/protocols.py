@@ -57,6 +57,7 @@ class Protocol(Value):
         displaced: when the object of a lift is displaced: "before" the approach, or halfway through the "approach".
         push: size of a force [N] in a random direction at the lifted object.
         relook: whether the camera looks at the object of a lift once more, from the same place, before the approach.
+        tries: largest number of grasps to try in a lift: another grasp where the object stays behind (`lift_grasps`).
 
     Raises:
         BadArgument: a rotation during the approach, or a push or a displacement in a protocol of pulls.
@@ -70,14 +71,16 @@ class Protocol(Value):
     displaced: Literal["before", "approach"] = "before"
     push: Annotated[float, Range(0.0, 1000.0)] = 0.0
     relook: bool = False
+    tries: Count = 1
 
     def __post_init__(self) -> None:
         """Raise `BadArgument` if fields contradict each other."""
         if self.displaced == "approach" and self.noise.rotation:
             raise BadArgument("noise.rotation", self.noise.rotation, "0 for an object displaced during the approach")
-        lifts = self.criterion, self.displaced, self.push, self.relook
-        if self.pull is not None and lifts != ("held", "before", 0.0, False):
-            raise BadArgument("pull", "a pull with a criterion, displacement, push or second look of a lift", "None")
+        lifts = self.criterion, self.displaced, self.push, self.relook, self.tries
+        if self.pull is not None and lifts != ("held", "before", 0.0, False, 1):
+            found = "a pull with a criterion, displacement, push, second look or tries of a lift"
+            raise BadArgument("pull", found, "None")
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":
@@ -114,7 +117,10 @@ PROTOCOLS = {
         Protocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
         Protocol("household", TrialSpec(shake=0.003, force=6.0)),
         Protocol(
-            "table-lift", TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.2, force=6.0), criterion="risen"
+            "table-lift",
+            TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.2, force=6.0),
+            criterion="risen",
+            tries=3,
         ),
     )
 }
@@ -128,7 +134,8 @@ PROTOCOLS = {
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
 * household: the same at friction 0.8 with a grip of 6 N.
 * table-lift: a lift by 0.2 m of 0.249 kg with friction 0.8 at the fingertips and 0.2 at the table, as published for
-  single-view policies. The object must have risen by 0.1 m at the end; `noise` and `push` displace and push it.
+  single-view policies. One of three grasps must have raised the object by 0.1 m at the end; `noise` and `push`
+  displace and push it.
 """
 
 

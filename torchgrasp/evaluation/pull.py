@@ -12,8 +12,8 @@ from torchgrasp.base import Value
 from torchgrasp.checks import Measured, Range, checked
 from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.evaluation.lift import run_lift
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, draw_push, find_protocol, seed_of
+from torchgrasp.evaluation.regrasp import lift_grasps
 from torchgrasp.evaluation.score import ProtocolResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.geometry.frames import rotation_angle
@@ -124,22 +124,25 @@ def run_protocol(
 ) -> ProtocolResult:
     """Run one trial of a grasp, pulls or a lift; the result stores the grasp's `rank` and the pose error's `draw`.
 
+    With `protocol.tries` > 1 the trial may hold further grasps, which are tried where a lift fails (`lift_grasps`).
     A force of the size `protocol.push` in a direction drawn from the trial's seed pushes the lifted object.
     """
     started = time.process_time()
     if protocol.push:
         protocol = protocol.with_trial(push=draw_push(protocol.push, seed_of(trial.seed, "push")))
-    driver = TrialDriver(trial, protocol.trial)
+    first = trial if protocol.tries == 1 else dataclasses.replace(trial, grasp=trial.grasp[0])
+    driver, tries = TrialDriver(first, protocol.trial), 1
     overlap = driver.grasp_overlap()
     if protocol.pull is not None:
         pull = run_pulls(driver, protocol.pull)
         status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
         slip, passed = ObjectMotion(math.nan, math.nan), status is Status.OK
     else:
-        lift = run_lift(driver)
+        *before, lift = lift_grasps(trial, protocol.trial, protocol.tries)
         status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
         force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
-        passed = lift.held if protocol.criterion == "held" else lift.rise >= 0.5 * protocol.trial.lift_height
+        tries, risen = len(before) + 1, lift.rise >= 0.5 * protocol.trial.lift_height
+        passed = lift.held if protocol.criterion == "held" else risen
     spent = time.process_time() - started
-    held = status is Status.OK
-    return ProtocolResult(rank, draw, passed, status, moved, turned, force, overlap, spent, *slip, held=held)
+    measured = moved, turned, force, overlap, spent, *slip
+    return ProtocolResult(rank, draw, passed, status, *measured, held=status is Status.OK, tries=tries)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.checks import Measured, checked
+from torchgrasp.checks import Count, Measured, checked
 from torchgrasp.control.reference import check_single
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
@@ -44,6 +44,7 @@ class ProtocolResult(Value):
         slip_angle: rotation of the object in the closed hand [rad], in a lift.
         predicted: predicted success of the grasp.
         held: whether the status is `OK`: in a lift the object is then held without slip (`close_hand`).
+        tries: number of grasps that were tried; all but `predicted`, `rank` and `overlap` is of the last grasp.
     """
 
     rank: int
@@ -59,6 +60,7 @@ class ProtocolResult(Value):
     slip_angle: Measured = math.nan
     predicted: Measured = math.nan
     held: bool = False
+    tries: Count = 1
 
 
 @checked
@@ -102,6 +104,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "top1": fraction of best-ranked grasps that passed; a view without grasps counts as failed.
     * "objects": fraction of objects with a success. "refused": number of views without a grasp.
     * "by_object", "by_group": the same numbers for each object or group.
+    * "tries": numbers of trials that passed with the first grasp, with the second grasp, and so on.
     * "failures": counts of statuses by stage. "fingers": counts of views by the grasping fingers.
     * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
     * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
@@ -118,11 +121,13 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     names = sorted({score.object for score in scores})
     by_object = {name: _shares([score for score in scores if score.object == name]) for name in names}
     groups = sorted({score.group for score in scores if score.group})
+    most = max((attempt.tries for attempt in attempts), default=1)
     reasons_of = {"planning": Counter(s.refusal.name for s in scores if s.refusal is not Status.OK)}
     for stage, reasons in STAGES.items():
         reasons_of[stage] = Counter(a.status.name for a in attempts if not a.passed and a.status in reasons)
     return {
         **_shares(scores),
+        "tries": [sum(a.passed and a.tries == k for a in attempts) for k in range(1, most + 1)],
         "failures": {stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts},
         "fingers": dict(Counter(score.fingers for score in scores if score.executable).most_common()),
         "force_n": _mean(a.force for a in attempts),

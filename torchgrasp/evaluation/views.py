@@ -167,7 +167,7 @@ def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -
 def try_grasp(
     view: View, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
 ) -> ProtocolResult:
-    """Try one grasp of a view in simulation; `at` is its rank and the number of the pose error's draw."""
+    """Try the first grasp of a view in simulation; `at` is its rank and the number of the pose error's draw."""
     hand = hand_of(grasp, view.load_hand())
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, *at)

@@ -128,6 +128,7 @@ def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     names = {
         "refused": ("views without a grasp: a failure of the best grasp, not of the grasps tried", "d"),
         "executable": ("executable grasps", "d"),
+        "tries": ("trials that passed with the first grasp, with the second grasp, ...", "d"),
         "force_n": ("mean normal force of a finger [N]", ".2f"),
         "overlap_mm": ("overlap of hand and object at the grasp, mean [mm]", ".1f"),
         "overlap_mm_max": ("overlap of hand and object at the grasp, most [mm]", ".1f"),

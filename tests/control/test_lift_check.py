@@ -1,0 +1,59 @@
+"""A lift that leaves the object behind is felt; a lift that holds it, be it light or carried by the palm, is not."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.point_fingers import FREE, PERIOD, TOUCHING, observation, on_table
+from torchgrasp.closure import SensorModel
+from torchgrasp.control.lift_check import LiftCheck
+
+ONE = torch.tensor([True, False, False])
+
+
+def lift(contact, load=0.0, reference=None, noise=0.0, speed=0.1):
+    """The check after each tick of a rise to 50 mm, in which the fingertips carry a load [N]."""
+    reference = on_table() if reference is None else reference
+    check, generator = LiftCheck(reference), torch.Generator().manual_seed(1)
+    up, lost = reference.table.normal, []
+    for k in range(round(0.05 / speed / PERIOD)):
+        drawn = noise * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+        seen = observation(0.0, (1.0, 1.0, 1.0), contact)
+        tactile = dataclasses.replace(seen.tactile, forces=load / 3 * up + drawn)
+        lost.append(check(dataclasses.replace(seen, tactile=tactile), (k + 1) * PERIOD * speed, PERIOD))
+    return lost
+
+
+def test_an_object_that_stays_behind_is_lost_for_good_once_the_hand_has_risen_by_a_centimetre():
+    lost = lift(FREE)
+    first = lost.index(True)
+    assert (first + 1) * PERIOD * 0.1 == pytest.approx(0.01, abs=0.1 * PERIOD) and all(lost[first:])
+    assert LiftCheck(on_table())(observation(0.0, contact=FREE), 0.02, PERIOD)
+
+
+@pytest.mark.parametrize("seconds", [0.5, 2.0])
+def test_an_object_of_50_grams_in_noisy_fingertips_is_not_lost(seconds):
+    assert not any(lift(ONE, load=0.05 * 9.81, noise=0.3 / 3**0.5, speed=0.05 / seconds))
+    assert not any(lift(TOUCHING, noise=0.3))
+
+
+def test_what_one_fingertip_and_the_palm_carry_is_not_lost_until_it_drops():
+    reference, check = on_table(), LiftCheck(on_table())
+    seen, forces = observation(0.0, contact=ONE), torch.zeros(3, 3, dtype=torch.float64)
+    for load, lost in ((1.0, False), (-0.5, True)):
+        forces[0] = load * reference.table.normal
+        there = dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, forces=forces.clone()))
+        for k in range(60):
+            found = check(there, 0.0 if load > 0 and k < 20 else 0.03, PERIOD)
+        assert found is lost
+
+
+def test_without_forces_or_table_the_touches_tell():
+    binary = dataclasses.replace(on_table(), sensor=SensorModel("binary"))
+    for reference in (binary, dataclasses.replace(on_table(), table=None)):
+        for contact in (TOUCHING, ONE, FREE):
+            check = LiftCheck(reference)
+            assert check(observation(0.0, contact=contact), 0.03, PERIOD) is (int(contact.sum()) < 2)
+    dead = dataclasses.replace(on_table(), sensor=SensorModel("binary", dead=(on_table().hand.finger_names[2],)))
+    assert not LiftCheck(dead)(observation(0.0, contact=ONE), 0.03, PERIOD)

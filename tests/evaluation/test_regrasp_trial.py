@@ -1,0 +1,131 @@
+"""A trial over several grasps: which grasp comes next, where the object then stands, and what the result tells."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from tests.make import real
+from tests.pinch import QUICK, cylinder, digest, pinch, quick_trial
+from torchgrasp import Plane
+from torchgrasp.closure import ClosingOptions
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.evaluation import GraspTrial, Protocol, ProtocolResult, PullSpec, Truth, ViewScore, summarise
+from torchgrasp.evaluation.lift import lift_grasp
+from torchgrasp.evaluation.protocols import apply_error
+from torchgrasp.evaluation.pull import run_protocol
+from torchgrasp.evaluation.regrasp import _left_behind, lift_grasps, next_grasp
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
+from torchgrasp.values import Grasps
+
+TURNED = real([0.0, 0.0, 1.0])
+
+
+def placed(degrees=0.0, x=0.0, y=0.0):
+    """A displacement along the table."""
+    return rigid(rotation_from_vector(math.radians(degrees) * TURNED), real([x, y, 0.0]))
+
+
+def several(*poses) -> Grasps:
+    """The pinch of the cylinder, displaced by each pose."""
+    _, grasp = pinch("allegro")
+    grasp, pose = grasp[[0] * len(poses)], torch.stack(poses)
+    contacts = dataclasses.replace(
+        grasp.contacts, points=apply(pose, grasp.contacts.points), normals=rotate(pose, grasp.contacts.normals)
+    )
+    approach = rotate(pose, grasp.approach[:, None])[:, 0]
+    return dataclasses.replace(grasp, obj_from_hand=pose @ grasp.obj_from_hand, contacts=contacts, approach=approach)
+
+
+def differs(grasps: Grasps, one: int, two: int) -> bool:
+    """Oracle: whether two grasps differ in direction or contacts, finger by finger."""
+    a, b = grasps[one], grasps[two]
+    gaps = [math.dist(p, q) for p, q in zip(a.contacts.points[0].tolist(), b.contacts.points[0].tolist(), strict=True)]
+    cosine = float(a.approach[0] @ b.approach[0])
+    return sum(gaps) / len(gaps) > 0.015 or math.degrees(math.acos(max(-1.0, min(1.0, cosine)))) > 30
+
+
+def test_the_next_grasp_is_the_best_that_differs_from_all_tried():
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.rand(30, 3, generator=generator, dtype=torch.float64) * real([90.0, 0.03, 0.03])
+    grasps, tried = several(*(placed(*row) for row in drawn.tolist())), [0]
+    while (found := next_grasp(grasps, tried)) is not None:
+        fresh = [k for k in range(30) if all(differs(grasps, k, other) for other in tried)]
+        assert found == fresh[0]
+        tried.append(found)
+    assert 2 < len(tried) < 30 and not any(all(differs(grasps, k, other) for other in tried) for k in range(30))
+
+
+@pytest.mark.parametrize(("pose", "fresh"), [((29.0,), True), ((0.0, 0.014), False), ((0.0, 0.016), True)])
+def test_a_grasp_is_another_by_its_contacts_or_its_direction(pose, fresh):
+    grasps = several(placed(), placed(*pose))
+    points = grasps.contacts.points[[0, 0]]
+    assert next_grasp(grasps, [0]) == (1 if fresh else None)
+    still = dataclasses.replace(grasps, contacts=dataclasses.replace(grasps.contacts, points=points))
+    assert next_grasp(still, [0]) is None  # less than 30 degrees at the same contacts
+
+
+RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0, attempts=1)
+MISSED, STILL = placed(0.0, 0.3), dataclasses.replace(QUICK, noise=False, approach=0.05, options=RIGID_ARM)
+
+
+def trial(*poses, **truth) -> GraspTrial:
+    return GraspTrial(pinch("allegro")[0], several(*poses), Truth(cylinder(), [cylinder()], **truth), seed=2)
+
+
+@pytest.mark.sim
+def test_a_trial_of_a_single_grasp_is_the_same_to_the_last_bit():
+    pytest.importorskip("sapien")
+    one = trial(placed())
+    (found,) = lift_grasps(one, QUICK)
+    (first,) = lift_grasps(dataclasses.replace(one, grasp=several(placed(), MISSED)), QUICK, tries=1)
+    assert digest(found) == digest(first) == digest(lift_grasp(one, QUICK))
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
+def test_a_hand_that_closed_beside_the_object_holds_it_with_the_second_grasp(simulator):
+    pytest.importorskip(simulator)
+    spec = dataclasses.replace(STILL, simulator=simulator)
+    missed, held = lift_grasps(trial(MISSED, placed()), spec)
+    assert (missed.status, held.status) == (Status.NO_CONTACT, Status.OK)
+    away = torch.linalg.vector_norm(missed.hand_pose[-1, :3, 3] - missed.hand_pose[0, :3, 3])
+    assert float(away) < 0.005  # it is back where it came from, and open
+    assert float((missed.joints[-1] - missed.joints[0]).abs().max()) < 0.05
+
+
+@pytest.mark.sim
+def test_a_held_object_is_not_tried_again_and_the_last_try_ends_the_trial():
+    pytest.importorskip("sapien")
+    (held,) = lift_grasps(trial(placed(), placed(90.0)), STILL)
+    assert held.held
+    failed = run_protocol(trial(MISSED, placed(0.0, 0.35), placed()), Protocol("twice", STILL, tries=2))
+    assert (failed.passed, failed.tries, failed.status) == (False, 2, Status.NO_CONTACT)
+
+
+@pytest.mark.sim
+def test_the_next_try_finds_all_bodies_where_the_last_left_them():
+    """The hand keeps its error in the world; the mesh moves as the object did, on the table that it stood on."""
+    pytest.importorskip("sapien")
+    aside, result = placed(3.0, 0.002), quick_trial()
+    first = trial(placed(), placed(90.0), error=aside)
+    fallen = rigid(rotation_from_vector(real([1.5, 0.2, 0.1])), real([0.02, 0.3, 0.04]))
+    result = dataclasses.replace(result, object_pose=torch.cat([result.object_pose[:-1], fallen[None]]))
+    truth = _left_behind(dataclasses.replace(first, grasp=first.grasp[0]), result, first.grasp.obj_from_hand[1])
+    expected = apply(fallen, torch.tensor(cylinder().vertices))
+    for body in (truth.mesh, *truth.parts):
+        assert torch.allclose(torch.tensor(body.vertices), expected, atol=1e-12)
+    assert truth.table.describe() == Plane.horizontal(0.0).describe()
+    one, two = first.grasp.obj_from_hand
+    shifts = [apply_error(pose, error) @ inverse(pose) for pose, error in ((one, aside), (two, truth.error))]
+    assert torch.allclose(shifts[0], shifts[1], atol=1e-12)
+
+
+def test_protocols_of_pulls_have_no_second_grasp_and_summaries_count_them():
+    with pytest.raises(BadArgument, match="tries of a lift"):
+        Protocol("pull", QUICK, PullSpec(1.0, 1.0, 0.1, 1.0), tries=2)
+    good = ProtocolResult(0, 0, True, Status.OK)
+    tried = good, dataclasses.replace(good, tries=3), dataclasses.replace(good, passed=False, tries=3)
+    assert summarise([ViewScore("jug", "view0", 9, 1.0, tried)])["tries"] == [1, 0, 1]
+    assert summarise([ViewScore("jug", "view0", 9, 1.0, (good,))])["tries"] == [1]

@@ -1,0 +1,130 @@
+"""A trial over several grasps: where the object stays behind in a lift, the hand opens and tries another grasp."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.checks import Count, checked
+from torchgrasp.closure import ClosureResult
+from torchgrasp.control.lift_check import LiftCheck
+from torchgrasp.control.recovery import Reopening
+from torchgrasp.control.tactile import Targets
+from torchgrasp.errors import Status
+from torchgrasp.evaluation.lift import _Lift, run_lift
+from torchgrasp.evaluation.protocols import apply_error, seed_of
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
+from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.sim.convex_parts import read_solid
+from torchgrasp.sim.scene_spec import Neighbour
+from torchgrasp.specs import TrialSpec
+from torchgrasp.threads import single_threaded
+from torchgrasp.values import Grasps
+
+
+@checked
+def next_grasp(grasps: Grasps, tried: Sequence[int]) -> int | None:
+    """Return the index of the best grasp that fails for another reason than those `tried`; None if there is none.
+
+    It approaches from another direction, by 30 degrees, or touches other places, on average 15 mm away.
+
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> next_grasp(load_shipped_grasp("jug", "barrett"), [0]) is None
+    True
+    """
+    points, approach, others = grasps.contacts.points, grasps.approach, list(tried)
+    gaps = torch.linalg.vector_norm(points[:, None] - points[others], dim=-1).mean(-1)
+    differs = (gaps > 0.015) | (approach @ approach[others].T < math.cos(math.radians(30)))
+    fresh = differs.all(-1).nonzero()
+    return int(fresh[0]) if len(fresh) else None
+
+
+@checked
+@single_threaded
+def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3) -> tuple[ClosureResult, ...]:
+    """Lift an object with the first grasp of a trial, and with others where a lift fails; return a result for each try.
+
+    Where the hand feels that the object stays behind (`LiftCheck`) or is too heavy, the hand goes down, opens and
+    withdraws. The next try (`next_grasp`) finds the object where it then stands, which only a camera tells the robot.
+
+    Args:
+        trial: the trial, with grasps in the order of preference; the truth's `error` is that of the first grasp.
+        spec: parameters of the trial; `TrialSpec()` by default.
+        tries: largest number of grasps to try; with one the trial is that of `close_hand`.
+
+    Raises:
+        BadArgument, MeshError, MissingExtra: as `close_hand`.
+    """
+    spec, grasps, tried, results = TrialSpec() if spec is None else spec, trial.grasp, [0], []
+    while True:
+        trial = dataclasses.replace(trial, grasp=grasps[tried[-1]])
+        following = next_grasp(grasps, tried) if len(tried) < tries else None
+        if following is None:  # the last try lifts whatever it feels
+            return *results, run_lift(TrialDriver(trial, spec))
+        lift, started = _CheckedLift(TrialDriver(trial, spec).open()), time.perf_counter()
+        results.append(lift.result(lift.perform(), time.perf_counter() - started))
+        if not lift.lost:
+            return tuple(results)
+        tried.append(following)
+        truth = _left_behind(trial, results[-1], grasps[following].obj_from_hand[0])
+        trial = dataclasses.replace(trial, truth=truth, seed=seed_of(trial.seed, "again"))
+
+
+class _CheckedLift(_Lift):
+    """A lift that ends where the hand feels that the object stays behind; `lost` then becomes true."""
+
+    def __init__(self, run: TrialRun) -> None:
+        super().__init__(run)
+        self.check, self.lost = LiftCheck(run.robot.reference), False
+
+    def _gives_up(self, height: float) -> bool:
+        """Return whether the object stays behind or is too heavy."""
+        rising = height < self.spec.lift_height
+        felt = rising and self.check(self.run.observation, height, self.run.robot.period)
+        self.lost = super()._gives_up(height) or felt
+        return self.lost
+
+    def _put_down(self, time: float, rising: float) -> Status:
+        """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift failed."""
+        status = super()._put_down(time, rising)
+        status = self._verdict() if self.check.lost else status
+        run, period, length = self.run, self.run.robot.period, self.spec.approach
+        joints, palm, _ = run.controller.targets
+        opening = Reopening(run.robot.reference, torch.zeros(6, dtype=torch.float64), joints, palm, reach=0.0)
+        while not opening.done:
+            run.robot.tick(Targets(opening(period), palm))
+            self._record()
+        ticks = run.robot.ticks(0.6)
+        for k in range(2 * ticks):
+            share, rate = smooth_step(min((k + 1) / ticks, 1.0))
+            run.scene.approach(length * share, -length * rate / (ticks * period))
+            run.robot.tick(Targets(opening.opened, palm))
+            self._record()
+        return status
+
+
+def _left_behind(trial: GraspTrial, result: ClosureResult, obj_from_hand: Float[Tensor, "4 4"]) -> Truth:
+    """Return the truth of the next try: all bodies are where the last try left them, and the hand errs alike."""
+    truth, planned = trial.truth, trial.grasp.obj_from_hand[0].to("cpu", torch.float64)
+    following = obj_from_hand.to(planned)
+    error = inverse(following) @ apply_error(planned, truth.error) @ inverse(planned) @ following
+    table = Plane.horizontal(float(read_mesh(truth.mesh).bounds[0, 2])) if truth.table is None else truth.table
+    bodies = Neighbour(read_mesh(truth.mesh), truth.parts), *truth.neighbours
+    poses = result.object_pose[-1], *result.disturbance.neighbour_pose[-1]
+    target, *others = (_moved(body, pose.numpy()) for body, pose in zip(bodies, poses, strict=True))
+    changes = {"error": error, "table": table, "neighbours": others, "slide": None}
+    return dataclasses.replace(truth, mesh=target.mesh, parts=target.parts, **changes)
+
+
+def _moved(body: Neighbour, pose: np.ndarray) -> Neighbour:
+    """Return a body whose mesh and convex parts are moved by a pose."""
+    mesh, parts = read_solid(body.mesh, body.parts)
+    moved = [solid.copy().apply_transform(pose) for solid in (mesh, *parts)]
+    return Neighbour(moved[0], moved[1:], body.mass)
