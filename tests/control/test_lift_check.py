@@ -7,7 +7,7 @@ import torch
 
 from tests.point_fingers import FREE, PERIOD, TOUCHING, observation, on_table
 from torchgrasp.closure import SensorModel
-from torchgrasp.control.lift_check import LiftCheck
+from torchgrasp.control.recovery import LiftCheck
 
 ONE = torch.tensor([True, False, False])
 

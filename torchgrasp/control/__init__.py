@@ -3,7 +3,7 @@
 from torchgrasp.closure import ClosingGains, ClosingOptions
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.forces import squeeze
-from torchgrasp.control.lift_check import LiftCheck
+from torchgrasp.control.recovery import LiftCheck
 from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.sensing import FingertipSensor, feel_flags, feel_torques
 from torchgrasp.control.tactile import Observation, TactileState, Targets, TipContact, measure, no_contact, observe

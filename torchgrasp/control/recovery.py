@@ -1,18 +1,20 @@
-"""Recovery when the object is not where it was seen: an approach that stops at a touch, and a second closing.
+"""Recovery when the object is not where it was seen: an approach that stops at a touch, a second closing, and a check.
 
-Both locate the object from touches (`Localization`) and move the palm to the object.
+The first two locate the object from touches (`Localization`) and move the palm to the object.
 """
 
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.checks import Range, checked
 from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.object_pose import Localization, Touches
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.tactile import STILL, Observation
+from torchgrasp.control.tactile import STILL, Observation, low_pass
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
@@ -167,6 +169,38 @@ class Reopening:
         else:
             self.time += period
         return torch.lerp(self.start, self.opened, min(self.time / OPENING_TIME, 1.0))
+
+
+class LiftCheck:
+    """Feel while a closed hand rises whether it has lost the object; `lost` then stays true.
+
+    The object is lost if fewer than two fingertips touch, and these carry hardly any load along the table's normal.
+    Only touches count for binary sensors, or without a table. Broken sensors count as touching.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.control import no_contact, observe
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> reference = ClosingReference.from_grasp(load_hand("allegro"), load_shipped_grasp("jug", "allegro"))
+    >>> LiftCheck(reference)(observe(reference.hand, reference.joints, no_contact()), height=0.02, period=0.01)
+    True
+    """
+
+    @checked
+    def __init__(self, reference: ClosingReference) -> None:
+        self.alive, self.lost, self.load = reference.alive, False, 0.0
+        self.table = None if reference.sensor.kind == "binary" else reference.table
+
+    @checked
+    def __call__(self, observation: Observation, height: float, period: Annotated[float, Range(1e-5, 1.0)]) -> bool:
+        """Return `lost` at the end of a tick of `period` [s], in which the hand has risen to `height` [m]."""
+        least, first = 0.2, 0.01  # load [N], and height [m] from which the hand is judged
+        tactile = observation.tactile
+        if self.table is not None:
+            load = float((tactile.forces @ self.table.normal.double()).sum())
+            self.load += low_pass(3.0, period) * (load - self.load)
+        slack = int((tactile.contact | ~self.alive).sum()) < 2 and self.load < least
+        self.lost = self.lost or (slack and height >= first)
+        return self.lost
 
 
 def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> Float[Tensor, "3"]:

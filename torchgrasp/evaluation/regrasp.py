@@ -12,14 +12,15 @@ from torch import Tensor
 
 from torchgrasp.checks import Count, checked
 from torchgrasp.closure import ClosureResult
-from torchgrasp.control.lift_check import LiftCheck
-from torchgrasp.control.recovery import Reopening
+from torchgrasp.control.controller import GraspController
+from torchgrasp.control.recovery import LiftCheck, Reopening
 from torchgrasp.control.tactile import Targets
+from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.lift import _Lift, run_lift
 from torchgrasp.evaluation.protocols import apply_error, seed_of
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
-from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.sim.convex_parts import read_solid
@@ -31,14 +32,7 @@ from torchgrasp.values import Grasps
 
 @checked
 def next_grasp(grasps: Grasps, tried: Sequence[int]) -> int | None:
-    """Return the index of the best grasp that fails for another reason than those `tried`; None if there is none.
-
-    It approaches from another direction, by 30 degrees, or touches other places, on average 15 mm away.
-
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> next_grasp(load_shipped_grasp("jug", "barrett"), [0]) is None
-    True
-    """
+    """Return the best-ranked grasp that differs from those `tried`: by 30 degrees in approach, or 15 mm in contacts."""
     points, approach, others = grasps.contacts.points, grasps.approach, list(tried)
     gaps = torch.linalg.vector_norm(points[:, None] - points[others], dim=-1).mean(-1)
     differs = (gaps > 0.015) | (approach @ approach[others].T < math.cos(math.radians(30)))
@@ -52,7 +46,8 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
     """Lift an object with the first grasp of a trial, and with others where a lift fails; return a result for each try.
 
     Where the hand feels that the object stays behind (`LiftCheck`) or is too heavy, the hand goes down, opens and
-    withdraws. The next try (`next_grasp`) finds the object where it then stands, which only a camera tells the robot.
+    withdraws. The object stays where it then is. The robot expects it where the touches of the last try tell, or looks
+    once more, and tries the grasp of `next_grasp`.
 
     Args:
         trial: the trial, with grasps in the order of preference; the truth's `error` is that of the first grasp.
@@ -70,57 +65,68 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
             return *results, run_lift(TrialDriver(trial, spec))
         lift, started = _CheckedLift(TrialDriver(trial, spec).open()), time.perf_counter()
         results.append(lift.result(lift.perform(), time.perf_counter() - started))
-        if not lift.lost:
+        if not (lift.check.lost or results[-1].status is Status.TOO_HEAVY):
             return tuple(results)
         tried.append(following)
-        truth = _left_behind(trial, results[-1], grasps[following].obj_from_hand[0])
+        pose, felt = grasps.obj_from_hand[following].to("cpu", torch.float64), _felt(lift.run.controller)
+        truth = _left_behind(trial, results[-1], felt, pose)
         trial = dataclasses.replace(trial, truth=truth, seed=seed_of(trial.seed, "again"))
 
 
 class _CheckedLift(_Lift):
-    """A lift that ends where the hand feels that the object stays behind; `lost` then becomes true."""
+    """A lift that ends where the hand feels that it has lost the object."""
 
     def __init__(self, run: TrialRun) -> None:
         super().__init__(run)
-        self.check, self.lost = LiftCheck(run.robot.reference), False
+        self.check = LiftCheck(run.robot.reference)
 
     def _gives_up(self, height: float) -> bool:
-        """Return whether the object stays behind or is too heavy."""
+        """Return whether the object is too heavy or, while the hand rises, lost."""
         rising = height < self.spec.lift_height
-        felt = rising and self.check(self.run.observation, height, self.run.robot.period)
-        self.lost = super()._gives_up(height) or felt
-        return self.lost
+        lost = rising and self.check(self.run.observation, height, self.run.robot.period)
+        return super()._gives_up(height) or lost
 
     def _put_down(self, time: float, rising: float) -> Status:
         """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift failed."""
-        status = super()._put_down(time, rising)
-        status = self._verdict() if self.check.lost else status
-        run, period, length = self.run, self.run.robot.period, self.spec.approach
+        status, run, length = super()._put_down(time, rising), self.run, self.spec.approach
         joints, palm, _ = run.controller.targets
         opening = Reopening(run.robot.reference, torch.zeros(6, dtype=torch.float64), joints, palm, reach=0.0)
         while not opening.done:
-            run.robot.tick(Targets(opening(period), palm))
+            run.robot.tick(Targets(opening(run.robot.period), palm))
             self._record()
         ticks = run.robot.ticks(0.6)
         for k in range(2 * ticks):
             share, rate = smooth_step(min((k + 1) / ticks, 1.0))
-            run.scene.approach(length * share, -length * rate / (ticks * period))
+            run.scene.approach(length * share, -length * rate / (ticks * run.robot.period))
             run.robot.tick(Targets(opening.opened, palm))
             self._record()
-        return status
+        return self._verdict() if self.check.lost else status
 
 
-def _left_behind(trial: GraspTrial, result: ClosureResult, obj_from_hand: Float[Tensor, "4 4"]) -> Truth:
-    """Return the truth of the next try: all bodies are where the last try left them, and the hand errs alike."""
+def _left_behind(
+    trial: GraspTrial, result: ClosureResult, felt: Float[Tensor, "4 4"], following: Float[Tensor, "4 4"]
+) -> Truth:
+    """Return the truth of the next try: all bodies are where the last try left them.
+
+    The hand errs as before, and the robot follows the displacement that it has felt, in the planned hand's frame.
+    """
     truth, planned = trial.truth, trial.grasp.obj_from_hand[0].to("cpu", torch.float64)
-    following = obj_from_hand.to(planned)
-    error = inverse(following) @ apply_error(planned, truth.error) @ inverse(planned) @ following
+    error = inverse(following) @ apply_error(planned, truth.error) @ felt @ inverse(planned) @ following
     table = Plane.horizontal(float(read_mesh(truth.mesh).bounds[0, 2])) if truth.table is None else truth.table
     bodies = Neighbour(read_mesh(truth.mesh), truth.parts), *truth.neighbours
     poses = result.object_pose[-1], *result.disturbance.neighbour_pose[-1]
     target, *others = (_moved(body, pose.numpy()) for body, pose in zip(bodies, poses, strict=True))
     changes = {"error": error, "table": table, "neighbours": others, "slide": None}
     return dataclasses.replace(truth, mesh=target.mesh, parts=target.parts, **changes)
+
+
+def _felt(controller: GraspController) -> Float[Tensor, "4 4"]:
+    """Return the displacement of the object that a controller has felt, in the planned hand's frame."""
+    closing, centre = controller.closing, controller.reference.gains.target.mean(0)
+    if not isinstance(closing, UncertaintyClosing):
+        return torch.eye(4, dtype=torch.float64)
+    shift, rotation = closing.displacement[:3], rotation_from_vector(closing.displacement[3:])
+    return rigid(rotation, centre + shift - rotation @ centre)
 
 
 def _moved(body: Neighbour, pose: np.ndarray) -> Neighbour:

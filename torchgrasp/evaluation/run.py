@@ -111,10 +111,7 @@ def _plan(view: View, shelf: Path, friction: float, spec: EvaluationSpec) -> Vie
 
 
 def _try(view: View, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
-    """Try the saved grasp with index `row` of a view in simulation, with the pose error of number `draw`.
-
-    A protocol with several tries gets the other grasps as well, best first.
-    """
+    """Try the saved grasp with index `row` of a view in simulation, with the pose error of number `draw`."""
     grasps = load_grasps(view.file(shelf))
-    others = [k for k in range(len(grasps)) if k != row and protocol.tries > 1]
+    others = [k for k in range(len(grasps)) if k != row and protocol.tries > 1]  # tried where the lift fails
     return try_grasp(view, grasps[[row, *others]], protocol, spec, (row, draw))
