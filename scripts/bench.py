@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-close  misplaced, sensors, perturb, holding, speed, success: closing and lifting in simulation
+close  misplaced, sensors, perturb, table-lift, holding, speed, success: closing and lifting in simulation
 gpu    kernels: every kernel of the chain on a GPU beside the CPU
 hand   fk, collision, codes: kinematics beside pytorch-kinematics, self-collision and inverse kinematics
 load   plans, trials, points, starts: memory over many plans and trials, and of large inputs

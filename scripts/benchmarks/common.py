@@ -39,7 +39,9 @@ class Options:
         grasps: grasps of each view, the best or spread over all ranks.
         starts: random starts of the contact planner.
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
-        simulator: of load/trials.
+        draws: trials of each grasp of close/table-lift, with other displacements, pushes and noise.
+        planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they are planned and kept.
+        simulator: of load/trials and close/table-lift.
         workers: processes that share the trials.
         threads: of torch.
         seed: of every random number.
@@ -57,6 +59,8 @@ class Options:
     grasps: int = 1
     starts: int = 1000
     scale: float = 1.0
+    draws: int = 5
+    planned: Path | None = None
     simulator: Literal["sapien", "mujoco"] = "sapien"
     workers: int = 1
     threads: int = 1

@@ -12,6 +12,7 @@ from torchgrasp.base import Value
 from torchgrasp.checks import Measured, Range, checked
 from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import BadArgument, Status
+from torchgrasp.evaluation.causes import find_cause
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, draw_push, find_protocol, seed_of
 from torchgrasp.evaluation.regrasp import lift_grasps
 from torchgrasp.evaluation.score import ProtocolResult
@@ -136,13 +137,15 @@ def run_protocol(
     if protocol.pull is not None:
         pull = run_pulls(driver, protocol.pull)
         status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
-        slip, passed = ObjectMotion(math.nan, math.nan), status is Status.OK
+        slip, passed, cause, size = ObjectMotion(math.nan, math.nan), status is Status.OK, "", math.nan
     else:
         *before, lift = lift_grasps(trial, protocol.trial, protocol.tries)
         status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
         force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
         tries, risen = len(before) + 1, lift.rise >= 0.5 * protocol.trial.lift_height
         passed = lift.held if protocol.criterion == "held" else risen
+        cause, size = find_cause(lift, trial, protocol.trial, before)
     spent = time.process_time() - started
     measured = moved, turned, force, overlap, spent, *slip
-    return ProtocolResult(rank, draw, passed, status, *measured, held=status is Status.OK, tries=tries)
+    held = status is Status.OK
+    return ProtocolResult(rank, draw, passed, status, *measured, held=held, tries=tries, cause=cause, size=size)

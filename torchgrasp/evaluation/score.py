@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import statistics
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -45,6 +46,8 @@ class ProtocolResult(Value):
         predicted: predicted success of the grasp.
         held: whether the status is `OK`: in a lift the object is then held without slip (`close_hand`).
         tries: number of grasps that were tried; all but `predicted`, `rank` and `overlap` is of the last grasp.
+        cause: why the object of a lift was not held, a name in `CAUSES`, or "".
+        size: size of the cause, in the cause's unit.
     """
 
     rank: int
@@ -61,6 +64,8 @@ class ProtocolResult(Value):
     predicted: Measured = math.nan
     held: bool = False
     tries: Count = 1
+    cause: str = ""
+    size: Measured = math.nan
 
 
 @checked
@@ -105,7 +110,8 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "objects": fraction of objects with a success. "refused": number of views without a grasp.
     * "by_object", "by_group": the same numbers for each object or group.
     * "tries": numbers of trials that passed with the first grasp, with the second grasp, and so on.
-    * "failures": counts of statuses by stage. "fingers": counts of views by the grasping fingers.
+    * "failures": counts of statuses by stage. "causes": why objects were not held, with counts and median sizes.
+    * "fingers": counts of views by the grasping fingers.
     * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
     * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
     * "success": calibration of the predictions (`judge`), or None.
@@ -129,6 +135,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         **_shares(scores),
         "tries": [sum(a.passed and a.tries == k for a in attempts) for k in range(1, most + 1)],
         "failures": {stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts},
+        "causes": _count_causes(scores),
         "fingers": dict(Counter(score.fingers for score in scores if score.executable).most_common()),
         "force_n": _mean(a.force for a in attempts),
         "overlap_mm": _mean(1e3 * a.overlap for a in attempts),
@@ -142,6 +149,17 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "by_object": by_object,
         "by_group": {name: _shares([score for score in scores if score.group == name]) for name in groups},
     }
+
+
+def _count_causes(scores: Sequence[ViewScore]) -> dict[str, dict[str, Any]]:
+    """Return for each cause of objects not held its count, counts by group, and median size; the commonest first."""
+    lost = [(a.cause, score.group, a.size) for score in scores for a in score.attempts if a.cause]
+    found = {}
+    for cause, count in Counter(name for name, _, _ in lost).most_common():
+        groups = Counter(group for name, group, _ in lost if name == cause)
+        middle = statistics.median([size for name, _, size in lost if name == cause])
+        found[cause] = {"count": count, "by_group": dict(groups.most_common()), "median": middle}
+    return found
 
 
 def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:

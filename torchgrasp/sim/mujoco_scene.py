@@ -162,9 +162,9 @@ def scene_mjcf(spec: SceneSpec) -> str:
         bits = _bits(TABLE_BIT, HAND_BIT)
         height = format_numbers((0.0, 0.0, spec.table_height))
         ET.SubElement(world, "geom", bits, name=TABLE, type="plane", size="1 1 0.1", pos=height, friction=slick)
-    _add_body(asset, world, OBJECT, spec.body, HAND_BIT | TABLE_BIT, slick)
-    for k, body in enumerate(spec.neighbours):
-        _add_body(asset, world, NEIGHBOUR.format(k), body, HAND_BIT | TABLE_BIT | OBJECT_BIT, slick)
+    for k, (body, hulls) in enumerate(zip((spec.body, *spec.neighbours), spec.hulls, strict=True)):
+        name, hits = (NEIGHBOUR.format(k - 1), OBJECT_BIT) if k else (OBJECT, 0)
+        _add_body(asset, world, name, body, hulls, _bits(OBJECT_BIT, HAND_BIT | TABLE_BIT | hits), slick)
     _add_hand(world, spec, urdf)
     for name in movable:
         add_drive(actuator, name, spec.drives[name])
@@ -173,18 +173,20 @@ def scene_mjcf(spec: SceneSpec) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def _add_body(asset: ET.Element, world: ET.Element, name: str, spec: Body, hits: int, friction: str) -> None:
-    """Add a free body of uniform density; `hits` are the bits of the collision groups with which it collides.
+def _add_body(
+    asset: ET.Element, world: ET.Element, name: str, spec: Body, hulls: list[np.ndarray], bits: Mapping[str, str],
+    friction: str,
+) -> None:  # fmt: skip
+    """Add a free body of uniform density, made of convex hulls; `bits` are those of its collision groups.
 
     A contact has the larger friction of its two bodies, so that a slick body sticks to the hand but not to the table.
     """
     body = ET.SubElement(world, "body", name=name)
     ET.SubElement(body, "freejoint", name=name)
     _weigh(body, spec.mass, spec.mesh.center_mass, spec.inertia[np.triu_indices(3)])
-    for k, part in enumerate(spec.parts):
-        corners = format_numbers(np.asarray(part.vertices, float).ravel())
-        ET.SubElement(asset, "mesh", name=f"{name}_{k}", vertex=corners)
-        ET.SubElement(body, "geom", _bits(OBJECT_BIT, hits), type="mesh", mesh=f"{name}_{k}", friction=friction)
+    for k, vertices in enumerate(hulls):
+        ET.SubElement(asset, "mesh", name=f"{name}_{k}", vertex=format_numbers(vertices.ravel()))
+        ET.SubElement(body, "geom", dict(bits), type="mesh", mesh=f"{name}_{k}", friction=friction)
 
 
 def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
@@ -146,6 +147,18 @@ class SceneSpec:
     def table_height(self) -> float:
         """The height [m] of the table."""
         return float(self.mesh.bounds[0, 2]) if self.height is None else self.height
+
+    @property
+    def hulls(self) -> list[list[np.ndarray]]:
+        """The vertices (v, 3) of the convex parts of the object and each neighbour; nearly on the table they lie on it.
+
+        On the facets of a scanned round body, the body would roll away before it is touched.
+        """
+        near = 3e-4  # [m]
+        found = [[np.array(x.vertices, dtype=float) for x in body.parts] for body in (self.body, *self.neighbours)]
+        for vertices in itertools.chain(*found) if self.table else ():
+            vertices[vertices[:, 2] < self.table_height + near, 2] = self.table_height
+        return found
 
     @checked
     def check_drives(self, names: list[str]) -> None:

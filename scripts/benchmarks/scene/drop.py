@@ -65,7 +65,9 @@ class SettlingTable:
 
     def add(self, body: Body, pose: np.ndarray) -> None:
         """Add a body at rest at a pose (4, 4) of its mesh's frame."""
-        self._bodies.append(rigid_body(self._sapien, self._physx, self._material, body, 0.005))
+        self._bodies.append(
+            rigid_body(self._sapien, self._physx, self._material, body, [x.vertices for x in body.parts], 0.005)
+        )
         self._bodies[-1].angular_damping = self._damping
         place(self._sapien, self._scene, "neighbour", self._bodies[-1])
         self.move(len(self._bodies) - 1, pose)

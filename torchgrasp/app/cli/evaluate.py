@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from torchgrasp import evaluation
 from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, STARTS_HELP, import_simulator, load_fingers
-from torchgrasp.app.report.evaluation import SHARE_NAMES, list_figures, write_evaluation
+from torchgrasp.app.report.evaluation import SHARE_NAMES, list_causes, list_figures, write_evaluation
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
 from torchgrasp.checks import Count, Range, Seed
@@ -136,7 +136,7 @@ def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
 
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
-    """Print the success rates of all objects and of each group, failures by stage, and further means and times."""
+    """Print the success rates of all objects and of each group, failures by stage and cause, and means and times."""
     rows = [(text, format_share(summary[key])) for key, text in SHARE_NAMES.items()]
     for name, group in summary["by_group"].items():
         rows += [(f"{name}: {text}", format_share(group[key])) for key, text in SHARE_NAMES.items()]
@@ -144,6 +144,7 @@ def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
         rows.append(("views by fingers", "; ".join(f"{n} {names}" for names, n in summary["fingers"].items())))
     for stage, reasons in summary["failures"].items():
         rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
+    rows += [(f"not held: {name}", text) for name, text in list_causes(summary)]
     print(f"\n{protocol}, {tried}\n{format_columns([*rows, *list_figures(summary)], left={0, 1})}")
 
 

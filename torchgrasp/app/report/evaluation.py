@@ -8,6 +8,7 @@ from typing import Any
 from torchgrasp.app.report.page import render
 from torchgrasp.checks import checked
 from torchgrasp.errors import Status
+from torchgrasp.evaluation.causes import CAUSES
 from torchgrasp.evaluation.intervals import Share, format_share
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.files import write_file
@@ -68,6 +69,7 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
             for stage, reasons in summary["failures"].items()
             for name, n in reasons.items()
         ],
+        causes=[(name, text, CAUSES[name][1]) for name, text in list_causes(summary)],
         notes=[(score.object, score.view, score.note) for score in scores if score.note],
         figures=list_figures(summary),
         success=success and (
@@ -120,6 +122,16 @@ def _object_rows(
         best = "-" if math.isnan(row["top1"].value) else f"{row['top1'].value:.0%}"
         cells = [outcome.get((name, view), "") for view in views]
         rows.append((name, *_share_cells(row["gsr"], 0), best, *cells))
+    return rows
+
+
+def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return table rows with each cause of objects not held: its name; its count, in all and by group, and its size."""
+    rows = []
+    for name, found in summary["causes"].items():
+        groups = ", ".join(f"{n} {group}" for group, n in found["by_group"].items() if group)
+        size = f"median {found['median']:.0f} {CAUSES[name][0]}"
+        rows.append((name, f"{found['count']}{groups and f' ({groups})'}, {size}"))
     return rows
 
 

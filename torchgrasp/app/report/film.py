@@ -17,10 +17,11 @@ from torchgrasp.app.report.canvas import (
     encode_figure,
     frame_camera,
 )
-from torchgrasp.app.report.run import explain_loss, first_touches, moments_of, moved_in_hand, tick_of
+from torchgrasp.app.report.run import explain_loss, first_touches, moments_of
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import add_solids, to_array
 from torchgrasp.closure import ClosureResult
+from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.hand import Hand
 

@@ -14,8 +14,9 @@ from torchgrasp.base import count_status
 from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
 from torchgrasp.errors import Status
+from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE, SLIP_ANGLE, SLIP_DISTANCE
-from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.explain import Explanation
@@ -168,23 +169,6 @@ def first_touches(closure: ClosureResult) -> list[int]:
     """Return the control tick at which each finger first touched the object, in the order of these touches."""
     touched = touching(closure)
     return [int(touched[:, finger].int().argmax()) for finger in closure.contact_order]
-
-
-def moved_in_hand(
-    closure: ClosureResult, centre: Float[Tensor, "3"]
-) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
-    """Return for each tick how far the object has moved [m] and turned [rad] in the hand since the hand pressed."""
-    hand_from_object = inverse(closure.hand_pose.double()) @ closure.object_pose.double()
-    start = hand_from_object[tick_of(closure, 2)]
-    centres = apply(hand_from_object, centre.double().expand(len(hand_from_object), 1, 3))[:, 0]
-    turn = rotation_angle(start[:3, :3].T @ hand_from_object[:, :3, :3])
-    return torch.linalg.vector_norm(centres - apply(start, centre.double()[None]), dim=-1), turn
-
-
-def tick_of(closure: ClosureResult, phase: int) -> int:
-    """Return the tick at which phase 0 (approach), 1 (closing) or 2 (pressing) ended; the last tick if it never did."""
-    end = closure.phases[phase]
-    return int((closure.time - end).abs().argmin()) if bool(end.isfinite()) else len(closure.time) - 1
 
 
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:

@@ -1,0 +1,110 @@
+"""Lifts of a quarter of a kilogram off a slippery table, in place, moved after the view, and pushed in the air.
+
+The best grasp of one view of each object is lifted under protocol "table-lift". An object without a grasp fails.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from paper.tables6_7 import format_points
+
+from benchmarks.common import Options, Row, bench
+from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, PoseNoise, Protocol, ViewScore, evaluate, summarise
+from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
+
+BASE = PROTOCOLS["table-lift"]
+
+BARS: dict[str, tuple[dict[str, Any], float, float]] = {
+    "in place": ({}, 0.97, 0.92),
+    "moved by up to 3 cm": ({"noise": PoseNoise(0.03)}, 0.93, 0.0),
+    "moved by up to 5 cm": ({"noise": PoseNoise(0.05)}, 0.85, 0.0),
+    "moved by up to 5 cm in the approach": ({"noise": PoseNoise(0.05), "displaced": "approach"}, 0.85, 0.0),
+    "pushed with 2.5 N": ({"push": 2.5}, 0.95, 0.0),
+}
+"""Conditions by name: changes of the protocol, and the project's bars for the shares risen and held without slip."""
+
+SIMULATORS = "both simulators"
+"""The condition that lifts in place with both simulators; `--grasps` gives the number of grasps of each view."""
+
+LEAST_AGREED, MOST_APART = 0.95, 0.02
+"""Bars of the simulators: share of equal verdicts, and difference of the shares held."""
+
+
+@bench("close/table-lift", objects=True)
+def table_lift(o: Options) -> list[Row]:
+    """Lift every object in each condition, with each hand."""
+    names = [name for name in o.conditions or (*BARS, SIMULATORS) if name in BARS or name == SIMULATORS]
+    rows = list[Row]()
+    for hand in map(load_hand, o.hands):
+        lift = functools.partial(_lift, o, hand)
+        for name in names:
+            if name == SIMULATORS:
+                rows += _agree(hand.name, lift(BASE, "sapien", o.grasps), lift(BASE, "mujoco", o.grasps))
+                continue
+            changes, least, strict = BARS[name]
+            scores = lift(dataclasses.replace(BASE, **changes), o.simulator, 1)
+            rows.append(_row(f"{hand.name}, {name}", scores, least, strict))
+            print(rows[-1], flush=True)
+    return rows
+
+
+def _lift(o: Options, hand: Hand, protocol: Protocol, simulator: str, grasps: int) -> list[ViewScore]:
+    """Return the scores of the objects under a protocol, with saved grasps, or with new ones that are then kept."""
+    noise = dataclasses.replace(protocol.noise, draws=o.draws)
+    protocol = dataclasses.replace(protocol, noise=noise).with_trial(simulator=simulator)
+    found = []
+    for folder in o.objects:
+        shelf = o.planned or o.out / "table-lift" / f"{hand.name}_{folder.name}"
+        spec = EvaluationSpec(grasps, starts=o.starts, only=o.names, seed=o.seed, views=1, planned=_kept(shelf))
+        found += evaluate(folder, hand, protocol, spec, folder=shelf, workers=o.workers)
+    return found
+
+
+def _kept(shelf: Path) -> bool:
+    """Return whether a folder has grasps."""
+    return any(shelf.glob("*/*.safetensors"))
+
+
+def _row(what: str, scores: Sequence[ViewScore], least: float, strict: float) -> Row:
+    """Return the shares that rose and that were held without slip, refusals, and causes."""
+    risen, held = summarise(scores), summarise([_strict(score) for score in scores])
+    words = [format_share(risen["top1"]), f"without slip {format_share(held['top1'])}"]
+    words += [f"{risen['refused']} of {len(scores)} refused"]
+    words += [f"{x['count']} {cause} ({_sizes(x)})" for cause, x in risen["causes"].items()]
+    bar = f">= {least:.0%}" + (f", without slip >= {strict:.0%}" if strict else "")
+    met = risen["top1"].value >= least and held["top1"].value >= strict
+    lost = [(x.object, a.draw, a.status.name, a.cause, a.size) for x in scores for a in x.attempts if not a.held]
+    numbers = {"risen": risen["top1"], "held": held["top1"], "causes": risen["causes"], "not held": lost}
+    return Row(what, bar, "; ".join(words), met, numbers)
+
+
+def _sizes(cause: dict[str, Any]) -> str:
+    """Return the median size of a cause, and its counts by group."""
+    groups = [f"{n} {group}" for group, n in cause["by_group"].items() if group]
+    return ", ".join([f"median {cause['median']:.0f}", *groups])
+
+
+def _strict(score: ViewScore) -> ViewScore:
+    """Return a score in which only trials without slip have passed."""
+    return dataclasses.replace(score, attempts=tuple(dataclasses.replace(x, passed=x.held) for x in score.attempts))
+
+
+def _agree(hand: str, first: Sequence[ViewScore], second: Sequence[ViewScore]) -> Iterator[Row]:
+    """Yield how often two simulators agree that an object has risen, and that it is held without slip."""
+    kinds = {"risen": (first, second), "without slip": (list(map(_strict, first)), list(map(_strict, second)))}
+    for kind, both in kinds.items():
+        one, other = ({(x.object, a.rank, a.draw): (x.unit, a.passed) for x in s for a in x.attempts} for s in both)
+        keys = sorted(one.keys() & other.keys())
+        same = share_over(count_by((one[key][0], one[key][1] == other[key][1]) for key in keys))
+        there, here = (count_by(some[key] for key in keys) for some in (one, other))
+        apart = difference_over(here, there)
+        words = f"{format_share(same)}; {share_over(there).value:.1%} in SAPIEN, MuJoCo {format_points(apart)}"
+        differ = [(*key, one[key][1], other[key][1]) for key in keys if one[key][1] != other[key][1]]
+        met = same.value >= LEAST_AGREED and abs(apart.value) <= MOST_APART
+        bar = f">= {LEAST_AGREED:.0%}, within {100 * MOST_APART:.0f} points"
+        yield Row(f"{hand}, same verdict, {kind}", bar, words, met, {"same": same, "apart": apart, "differ": differ})

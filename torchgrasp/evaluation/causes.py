@@ -1,0 +1,98 @@
+"""Why an object was not held: the cause of a failed trial, from the trial's record and the true object."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.checks import checked
+from torchgrasp.closure import ClosureResult
+from torchgrasp.errors import Status
+from torchgrasp.evaluation.lift import LIFT_TIME, SLIP_ANGLE, SLIP_DISTANCE
+from torchgrasp.evaluation.regrasp import next_grasp
+from torchgrasp.evaluation.trial import GraspTrial
+from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.specs import TrialSpec
+
+CAUSES = {
+    "start overlap": ("mm", "the opened hand overlapped the object or the table"),
+    "toppled": ("deg", "the object tilted by more than 30 degrees before the lift"),
+    "pushed away": ("mm", "the object moved by more than 20 mm before all fingers touched"),
+    "ejected": ("mm", "the object moved by more than 20 mm between the last touch and the lift"),
+    "shape off": ("mm", "a planned contact was more than 10 mm off the true surface"),
+    "never met": ("mm", "a finger never touched; its planned contact was so far off the surface"),
+    "too weak": ("N", "the drives were at their limits; the size is the largest normal force"),
+    "dropped when pushed": ("N", "the lifted object was lost under the push"),
+    "turned": ("deg", "the object turned in the closed hand by more than 30 degrees, before it slid"),
+    "slid": ("mm", "the object slid in the closed hand, or hung on one finger"),
+}
+"""Causes by name: the unit of the size, and a sentence. The first that applies to a trial is its cause."""
+
+
+@checked
+def find_cause(
+    lift: ClosureResult, trial: GraspTrial, spec: TrialSpec, before: Sequence[ClosureResult] = ()
+) -> tuple[str, float]:
+    """Return why the object of a lift was not held (`CAUSES`), and the size of the cause; "" and NaN if it was held.
+
+    `before` are the results of the tries before this lift (`lift_grasps`).
+    """
+    if lift.held or lift.status is Status.UNSTABLE:
+        return "", math.nan
+    if lift.status is Status.START_OVERLAP:
+        return "start overlap", 1e3 * lift.start_overlap
+    tried, truth = [0], trial.truth
+    for result in reversed(before):  # each record begins with the object where the try before left it
+        lift = dataclasses.replace(lift, object_pose=lift.object_pose @ result.object_pose[-1])
+        tried.append(next_grasp(trial.grasp, tried) or 0)
+        truth = dataclasses.replace(truth, slide=None)
+    trial = dataclasses.replace(trial, grasp=trial.grasp[tried[-1]], truth=truth)
+    return next((cause, size) for cause, size, least in _sizes(lift, trial, spec) if size > least)
+
+
+def _sizes(lift: ClosureResult, trial: GraspTrial, spec: TrialSpec) -> Iterator[tuple[str, float, float]]:
+    """Yield every cause of a lift, its size, and the size above which it applies; NaN if it cannot apply."""
+    from trimesh.proximity import closest_point
+
+    mesh, truth = read_mesh(trial.truth.mesh), trial.truth
+    up = torch.tensor([0.0, 0.0, 1.0]).double() if truth.table is None else truth.table.normal.double()
+    centre, (touched, pressed) = torch.tensor(mesh.center_mass.tolist()).double(), (tick_of(lift, k) for k in (1, 2))
+    start, closed, lifted = apply(lift.object_pose[[0, touched, pressed]], centre.expand(3, 1, 3))[:, 0]
+    start = start if truth.slide is None else start + truth.slide.to(start)
+    upright = lift.object_pose[[0, pressed], :3, :3] @ up
+    tilt = torch.atan2(torch.linalg.cross(*upright).norm(), upright[0] @ upright[1])
+    yield "toppled", math.degrees(tilt), math.degrees(SLIP_ANGLE)
+    yield "pushed away", 1e3 * float((closed - start).norm()), 1e3 * SLIP_DISTANCE
+    yield "ejected", 1e3 * float((lifted - closed).norm()), 1e3 * SLIP_DISTANCE
+    off = 1e3 * closest_point(mesh, trial.grasp.contacts.points[0].double().numpy())[1]
+    yield "shape off", float(off.max()), 10.0
+    missing = [finger for finger in range(len(off)) if finger not in lift.contact_order]
+    yield "never met", float(off[missing].max()) if missing else math.nan, -1.0
+    weak = lift.status in (Status.TOO_WEAK, Status.TOO_HEAVY)
+    yield "too weak", float(lift.forces[pressed].max()) if weak else math.nan, -1.0
+    slid, turned = (motion[pressed:] for motion in moved_in_hand(lift, centre))
+    lost = (slid >= SLIP_DISTANCE) | (turned >= SLIP_ANGLE)
+    first, risen = int(lost.int().argmax()), int((lift.time <= lift.time[pressed] + LIFT_TIME).sum()) - 1 - pressed
+    yield "dropped when pushed", math.nan if bool(lost[risen]) else math.hypot(*spec.push), 0.0
+    rotates = bool(lost[first]) and bool(slid[first] < SLIP_DISTANCE)
+    yield "turned", math.degrees(turned.max()) if rotates else math.nan, 0.0
+    yield "slid", 1e3 * float(slid.max()), -1.0
+
+
+def tick_of(lift: ClosureResult, phase: int) -> int:
+    """Return the tick at which phase 0 (approach), 1 (closing) or 2 (pressing) ended; the last tick if it never did."""
+    end = lift.phases[phase]
+    return int((lift.time - end).abs().argmin()) if bool(end.isfinite()) else len(lift.time) - 1
+
+
+def moved_in_hand(lift: ClosureResult, centre: Float[Tensor, "3"]) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
+    """Return for each tick how far the object has moved [m] and turned [rad] in the hand since the hand pressed."""
+    hand_from_object = inverse(lift.hand_pose.double()) @ lift.object_pose.double()
+    start = hand_from_object[tick_of(lift, 2)]
+    centres = apply(hand_from_object, centre.double().expand(len(hand_from_object), 1, 3))[:, 0]
+    turn = rotation_angle(start[:3, :3].T @ hand_from_object[:, :3, :3])
+    return torch.linalg.vector_norm(centres - apply(start, centre.double()[None]), dim=-1), turn
