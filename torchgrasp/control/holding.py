@@ -11,6 +11,7 @@ from torchgrasp.control.least_forces import Balance, LeastForces, balance, frict
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, low_pass
 from torchgrasp.errors import Status
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.plan.forces import least_friction_forces
 
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
@@ -20,6 +21,9 @@ MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations o
 PRIOR_STD, MIN_STD = 0.2, 0.03  # standard deviation of the friction estimate at the start, and its least value
 SLIDING = 0.008  # speed [m/s] from which a fingertip counts as sliding
 FORCE_LAG = 0.03  # time [s] of sliding until the filtered forces show the friction
+PUSH = 2.5
+DENSITY = 1000.0
+FULL = True
 LIFTED = 0.35  # load [N] from which the object counts as lifted
 
 
@@ -126,11 +130,13 @@ class GripHold:
         self.solver = LeastForces(forces.numpy().copy(), effort, max_force)
         push = np.abs((forces.numpy() * self.normals).sum(-1))
         self.planned = np.maximum(push, 0.01 * max(float(push.max()), MIN_PUSH))
-        self.grip, self.least = np.minimum(push, max_force), np.full(len(push), MIN_PUSH)
+        self.grip, self.least = np.zeros(len(push)), np.full(len(push), MIN_PUSH)
+        self.centre, self.unfelt = _likely_body(reference)
+        self.cover = 1.0
         self.felt, self.load, self.carried = np.zeros((len(push), 3)), np.zeros(6), np.zeros(6)
         self.up = None if reference.table is None else reference.table.normal.numpy()
-        self.friction, self.optimism = FrictionEstimate(), 0.0
-        self.aim = self.friction.low
+        self.friction = FrictionEstimate()
+        self.aim = self.friction.mean
         self.sent, self.trim, self.most = *np.zeros((2, len(push), 3)), 0.0
         self.time = self.steady = self.over = 0.0
         self.released = False
@@ -147,7 +153,8 @@ class GripHold:
         jacobian, fastest_rise = observation.jacobian.numpy(), 60.0  # [N/s]
         contacts = self._feel(observation, period)
         self._adapt(observation, period)
-        wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, self._floor())
+        reserve = self._reserve(contacts)
+        wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, self._floor(), reserve)
         self._judge(wanted, jacobian, period)
         step = self._command(contacts, wanted, period) - self.sent
         length = np.linalg.norm(step, axis=-1, keepdims=True)
@@ -168,7 +175,8 @@ class GripHold:
         normals = _sensed(observation, self.normals)
         self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
         self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
-        contacts = balance(observation.tips.numpy() - self.radius[:, None] * self.normals)
+        points = observation.tips.numpy() - self.radius[:, None] * self.normals
+        contacts, self.arm = balance(points), self.centre - points.mean(0)
         forces = observation.tactile.forces.numpy()
         self.felt = self.felt + low_pass(8.0, period) * (forces - self.felt)
         load = self._weight(contacts.wrench @ forces.ravel())
@@ -178,7 +186,7 @@ class GripHold:
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
         """Return the part of a load wrench that weight can cause: an upward force and a limited torque."""
-        if self.up is None:
+        if self.up is None or (self.released and FULL):
             return load
         lifted = max(float(load[:3] @ self.up), 0.0)
         torque = load[3:] * min(1.0, 0.1 * lifted / max(float(np.linalg.norm(load[3:])), 1e-9))
@@ -208,8 +216,6 @@ class GripHold:
 
     def _release(self, moving: bool, period: float) -> None:
         """Reduce the forces once the lifted load is steady; when they are low, assume a higher friction coefficient."""
-        if moving:
-            self.optimism = 0.0
         if moving or self.weight > 1.05 * self.most:
             self.most, self.steady = max(self.most, self.weight), 0.0
         self.steady += period
@@ -217,22 +223,28 @@ class GripHold:
             return
         self.released = True
         self.grip = np.maximum(self.grip * (1 - min(3.0 * period, 1.0)), np.minimum(self.least, self.grip))
-        if self.friction.std > 2 * MIN_STD and bool((self.grip < 1.2 * self.least).all()):
-            self.optimism += 0.1 * period
+        self.unfelt *= 1 - min(3.0 * period, 1.0)
+
+    def _reserve(self, contacts: Balance) -> np.ndarray:
+        """Return the normal force [N] that keeps each finger's force in its cone when the object is pushed."""
+        push = PUSH + max(self.unfelt - self.weight, 0.0)
+        turning = np.cross(self.arm, np.eye(3)).T
+        response = (contacts.inverse @ np.concatenate([np.eye(3), turning])).reshape(-1, 3, 3)
+        along = (self.normals[:, None] @ response)[:, 0]
+        across = np.linalg.norm(response - self.normals[:, :, None] * along[:, None], ord=2, axis=(1, 2))
+        return self.cover * push * np.hypot(np.linalg.norm(along, axis=-1), across / self.aim)
 
     def _enough(self) -> float:
         """Return an upper bound on the sum of normal forces [N]; larger forces would move the object in the hand."""
-        return 3.0 * (self.weight + 0.5) / self.friction.low
+        return 3.0 * (self.weight + PUSH) / self.friction.mean
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
         """Choose the friction coefficient for the forces of the next tick; judge whether the load is too heavy."""
-        share, push = self.solver.share(self.normals, jacobian), -float((wanted * self.normals).sum())
-        goal = min(self.friction.low + self.optimism, self.friction.high)
-        if share > 1.0 or push > max(self._enough(), float(self.grip.sum())):
-            goal = self.friction.high
-        fastest = 2.0 * period
+        share, fastest = self.solver.share(self.normals, jacobian), 2.0 * period
+        self.cover = min(max(self.cover + math.copysign(fastest, 0.95 - share), 0.0), 1.0)
+        goal = self.friction.high if share > 1.0 and self.cover == 0.0 else self.friction.mean
         self.aim += min(max(goal - self.aim, -fastest), fastest)
-        beyond = share > 0.95 and bool((self.slid > FORCE_LAG).any())
+        beyond = share > 0.95 and self.cover == 0.0 and bool((self.slid > FORCE_LAG).any())
         self.over = self.over + period if beyond and self.weight > LIFTED else 0.0
         if self.over > 0.25:  # [s]
             self.status = Status.TOO_HEAVY
@@ -248,6 +260,17 @@ class GripHold:
             self.trim = self.trim * min(1.0, bound / max(largest, 1e-9))
         missing = self.load - 0.8 * self.carried  # carrying all of it would press ever harder on a rigid table
         return wanted + self.trim - (contacts.inverse @ missing).reshape(-1, 3)
+
+
+def _likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
+    """Return the centre [m] of the object in the hand's frame, and the largest weight [N] of an object of its size."""
+    field, points = reference.surface, reference.gains.target
+    if field is None or not bool((field.values < 0).any()):
+        return points.mean(0).numpy(), 9.81 * DENSITY * math.pi / 6 * float(torch.cdist(points, points).max()) ** 3
+    shell, inside = (field.values.abs() < field.spacing).nonzero(), (field.values < 0).nonzero()
+    inside = inside[((inside >= shell.amin(0)) & (inside <= shell.amax(0))).all(-1)]  # far away the sign may be wrong
+    centre = apply(inverse(reference.obj_from_hand), field.origin + field.spacing * inside.double().mean(0)[None])[0]
+    return centre.numpy(), 9.81 * DENSITY * len(inside) * field.spacing**3
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:

@@ -3,9 +3,10 @@
 For normal forces n_i above floor_i, tangential forces t_i, joint torques tau_j, friction coefficient mu and a small
 weight eps of the barrier, the method minimises
 
-    sum n_i + PENALTY sum max(|tau_j| / effort_j - KNEE, 0)^2 - eps sum [log(mu^2 n_i^2 - |t_i|^2) + log(n_i - floor_i)]
+    sum n_i + PENALTY sum max(|tau_j| / effort_j - KNEE, 0)^2
+        - eps sum [log(mu^2 (n_i - reserve_i)^2 - |t_i|^2) + log(n_i - floor_i)]
 
-over all forces that balance the load. It is written in NumPy, whose calls cost less than torch's for small matrices.
+over all forces that balance the load. A reserve keeps a force within its cone when a push changes the force. It is written in NumPy, whose calls cost less than torch's for small matrices.
 """
 
 import math
@@ -68,22 +69,24 @@ class LeastForces:
         load: Float[Array, "6"],
         friction: float,
         floor: Float[Array, "f"],
+        reserve: Float[Array, "f"] | float = 0.0,
     ) -> Float[Array, "f 3"]:
         """Return the least forces [N] that exert the wrench `load`, with normal forces above each finger's `floor` [N].
 
-        The forces are within the cones of the coefficient `friction`. If no such forces are found, the coefficient is
-        raised to the least with which forces were found.
+        Without the normal force `reserve` [N], the forces are within the cones of the coefficient `friction`. If no
+        such forces are found, the coefficient is raised to the least with which forces were found.
         """
+        floor = np.maximum(floor, reserve)
         count = len(normals)
         push = -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], push])
         gap = 0.01 * (float(np.linalg.norm(load[:3])) + float(floor.sum()))  # distance from the cones beyond the noise
-        barrier = _Barrier(contacts, normals, limits, load, gap)
+        barrier = _Barrier(contacts, normals, limits, load, gap, reserve)
         growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # added internal forces, if the load has grown
         tried = barrier.place(self.forces) + growth[:, None] * barrier.place(self.start, 0.0)
         z = barrier.choose(tried, friction, floor)
         lengths = 2.0 ** np.arange(8)  # multiples of a step that is safe for every self-concordant function
-        for _ in range(8 if math.isfinite(barrier.slack) else 0):  # no cone contains a finger that does not press
+        for _ in range(8 if math.isfinite(barrier.squared) else 0):  # no cone contains a finger that does not press
             step, decrement = barrier.newton(z)
             trial = z + np.minimum(lengths / (1 + decrement), 1.0)[:, None] * step
             value = barrier.value(trial)
@@ -111,8 +114,9 @@ class _Barrier:
         limits: Float[Array, "l n"],
         load: Float[Array, "6"],
         gap: float,
+        reserve: Float[Array, "f"] | float,
     ) -> None:
-        self.count, self.gap = len(normals), gap
+        self.count, self.gap, self.reserve = len(normals), gap, reserve
         self.basis, self.carried = contacts.free, contacts.inverse @ load
         self.rows = self.basis.reshape(self.count, 3, -1)
         self.spread = np.einsum("nik,nil->nkl", self.rows, self.rows)
@@ -132,21 +136,23 @@ class _Barrier:
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
-        """Return the best of g initial coordinates z; if none is feasible, raise the friction and lower the floors."""
+        """Return the best of g initial coordinates z; if none is feasible, raise the friction, lower floors and reserves."""
         push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
         across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
-        ratio = np.where(push > 0, across / np.maximum(push, 1e-12), np.inf).max(-1)
         above = (push > floor).all(-1)
         self.floor = floor if above.any() else np.minimum(floor, 0.5 * push[-1]).clip(min=0.0)
+        self.reserve = np.minimum(self.reserve, self.floor)
+        left = push - self.reserve
+        ratio = np.where(left > 0, across / np.maximum(left, 1e-12), np.inf).max(-1)
         ratio = np.where(above if above.any() else np.arange(len(tried)) == len(tried) - 1, ratio, np.inf)
-        self.slack = 1.0 + max(friction, 1.05 * float(ratio.min()) if ratio.min() >= friction else 0.0) ** 2
+        self.squared = max(friction, 1.05 * float(ratio.min()) if ratio.min() >= friction else 0.0) ** 2
         value = self.value(tried)
         return tried[int((value if np.isfinite(value).any() else ratio).argmin())]
 
     def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
         """Return the objective at each row of coordinates z; it is infinite outside the friction cones."""
         n, t = z @ self.push.T + self.push_0, z @ self.tau.T + self.tau_0
-        cone = self.slack * n * n - (self.forces(z) ** 2).sum(-1)
+        cone = self.squared * (n - self.reserve) ** 2 + n * n - (self.forces(z) ** 2).sum(-1)
         inside = ((cone > 0) & (n > self.floor)).all(-1)
         with np.errstate(invalid="ignore", divide="ignore"):
             logs = np.log(cone).sum(-1) + np.log(n - self.floor).sum(-1)
@@ -157,12 +163,13 @@ class _Barrier:
         """Return Newton's step at coordinates z, and the Newton decrement, which measures how far the optimum is."""
         gap, push = self.gap, self.push
         n, t, force = push @ z + self.push_0, self.tau @ z + self.tau_0, self.forces(z)
-        cone = self.slack * n * n - (force * force).sum(-1)
-        half = self.slack * n[:, None] * push - np.einsum("ni,nik->nk", force, self.rows)  # half the cone's gradient
+        left = n - self.reserve
+        cone = self.squared * left * left + n * n - (force * force).sum(-1)
+        half = (self.squared * left + n)[:, None] * push - np.einsum("ni,nik->nk", force, self.rows)  # of the gradient
         above, over = n - self.floor, np.sign(t) * (np.abs(t) - KNEE).clip(min=0.0)
         gradient = push.sum(0) + 2 * PENALTY * over @ self.tau - gap * ((2 / cone) @ half + (1 / above) @ push)
         hessian = (self.tau.T * (2 * PENALTY * (over != 0))) @ self.tau + gap * ((push.T / above**2) @ push)
-        hessian += gap * ((half.T * (4 / cone**2)) @ half - 2 * self.slack * (push.T / cone) @ push)
+        hessian += gap * ((half.T * (4 / cone**2)) @ half - 2 * (1 + self.squared) * (push.T / cone) @ push)
         hessian += gap * np.einsum("n,nkl->kl", 2 / cone, self.spread)
         step = -np.linalg.solve(hessian + 1e-9 * np.eye(len(z)), gradient)
         return step, math.sqrt(max(-float(gradient @ step), 0.0) / gap)
