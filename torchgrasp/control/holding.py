@@ -19,12 +19,9 @@ MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a senso
 RAMP = 0.4  # time [s] in which the forces rise to the desired forces
 MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations of its reading
 PRIOR_STD, MIN_STD = 0.2, 0.03  # standard deviation of the friction estimate at the start, and its least value
-SLIDING = 0.008  # speed [m/s] from which a fingertip counts as sliding
 FORCE_LAG = 0.03  # time [s] of sliding until the filtered forces show the friction
-PUSH = 2.5
-DENSITY = 1000.0
-FULL = True
 LIFTED = 0.35  # load [N] from which the object counts as lifted
+PUSH = 2.5  # force [N] from any side at the object's centre that a grip withstands without pressing harder
 
 
 class ForceHold:
@@ -104,19 +101,16 @@ class FrictionEstimate:
         self.std = max(self.std * math.sqrt(1 - weight), MIN_STD)
 
     @property
-    def low(self) -> float:
-        """A lower bound of the friction coefficient: the mean less one standard deviation."""
-        return max(self.mean - self.std, 0.15)
-
-    @property
     def high(self) -> float:
         """An upper bound of the friction coefficient: the mean plus one standard deviation."""
         return self.mean + self.std
 
 
 class GripHold:
-    """Press with the least forces that carry the load felt by the fingertips; none exceeds `reference.max_force`.
+    """Press with the least forces that carry the load felt by the fingertips, and a push of `PUSH` from any side.
 
+    Until the lifted load is steady, the reserve also covers the largest weight that an object of this size may have.
+    The reserve shrinks where torques or forces would exceed their limits; no force exceeds `reference.max_force`.
     `status` becomes `TOO_HEAVY` when a fingertip slides although the torques or forces have reached their limits.
     """
 
@@ -130,12 +124,11 @@ class GripHold:
         self.solver = LeastForces(forces.numpy().copy(), effort, max_force)
         push = np.abs((forces.numpy() * self.normals).sum(-1))
         self.planned = np.maximum(push, 0.01 * max(float(push.max()), MIN_PUSH))
-        self.grip, self.least = np.zeros(len(push)), np.full(len(push), MIN_PUSH)
-        self.centre, self.unfelt = _likely_body(reference)
-        self.cover = 1.0
+        self.grip = np.zeros(len(push))
         self.felt, self.load, self.carried = np.zeros((len(push), 3)), np.zeros(6), np.zeros(6)
         self.up = None if reference.table is None else reference.table.normal.numpy()
-        self.friction = FrictionEstimate()
+        self.centre, self.unfelt = likely_body(reference)
+        self.friction, self.cover = FrictionEstimate(), 1.0
         self.aim = self.friction.mean
         self.sent, self.trim, self.most = *np.zeros((2, len(push), 3)), 0.0
         self.time = self.steady = self.over = 0.0
@@ -151,9 +144,8 @@ class GripHold:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
         jacobian, fastest_rise = observation.jacobian.numpy(), 60.0  # [N/s]
-        contacts = self._feel(observation, period)
+        contacts, reserve = self._feel(observation, period)
         self._adapt(observation, period)
-        reserve = self._reserve(contacts)
         wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, self._floor(), reserve)
         self._judge(wanted, jacobian, period)
         step = self._command(contacts, wanted, period) - self.sent
@@ -166,27 +158,27 @@ class GripHold:
 
     def _floor(self) -> np.ndarray:
         """Return the least allowed normal force [N] of each finger; it leaves room below the largest allowed force."""
-        floor = np.maximum(self.grip, self.least)
+        floor = np.maximum(self.grip, MIN_PUSH)
         largest = float((floor / self.planned).max() * self.planned.max())
         return floor * min(1.0, 0.8 * self.solver.most / largest)
 
-    def _feel(self, observation: Observation, period: float) -> Balance:
-        """Filter the sensed forces, load and normals; return the contacts' grasp map with its pseudo-inverse."""
+    def _feel(self, observation: Observation, period: float) -> tuple[Balance, np.ndarray]:
+        """Filter the sensed forces, load and normals; return the contacts' grasp map and each finger's reserve [N]."""
         normals = _sensed(observation, self.normals)
         self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
         self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
         points = observation.tips.numpy() - self.radius[:, None] * self.normals
-        contacts, self.arm = balance(points), self.centre - points.mean(0)
-        forces = observation.tactile.forces.numpy()
+        contacts, forces = balance(points), observation.tactile.forces.numpy()
         self.felt = self.felt + low_pass(8.0, period) * (forces - self.felt)
         load = self._weight(contacts.wrench @ forces.ravel())
         self.load = self.load + low_pass(3.0, period) * (load - self.load)
         self.carried = self.carried + low_pass(0.7, period) * (load - self.carried)  # a faster one rocks the object
-        return contacts
+        push = self.cover * (PUSH + max(self.unfelt - self.weight, 0.0))
+        return contacts, push * push_reserve(contacts, self.normals, self.centre - points.mean(0), self.aim)
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
-        """Return the part of a load wrench that weight can cause: an upward force and a limited torque."""
-        if self.up is None or (self.released and FULL):
+        """Return a load wrench; before the lift only the part that weight can cause, an upward force and its torque."""
+        if self.up is None or self.released:
             return load
         lifted = max(float(load[:3] @ self.up), 0.0)
         torque = load[3:] * min(1.0, 0.1 * lifted / max(float(np.linalg.norm(load[3:])), 1e-9))
@@ -194,17 +186,13 @@ class GripHold:
 
     def _adapt(self, observation: Observation, period: float) -> None:
         """Press harder where a finger slides, update the friction estimate, and reduce forces that are not needed."""
-        speed = observation.tactile.sliding.numpy()
-        self.creep = self.creep + low_pass(1.0, period) * (speed.clip(max=SLIDING) - self.creep)
-        slides = (speed > SLIDING) & observation.tactile.contact.numpy()
-        starts = slides & (self.slid == 0.0)
+        speed, sliding = observation.tactile.sliding.numpy(), 0.008  # [m/s]
+        self.creep = self.creep + low_pass(1.0, period) * (speed.clip(max=sliding) - self.creep)
+        slides = (speed > sliding) & observation.tactile.contact.numpy()
         self.slid = np.where(slides, self.slid + period, 0.0)
         if self.time < RAMP:
             return
         push = -(self.felt * self.normals).sum(-1)
-        creeps = self.creep > 0.002  # [m/s]
-        slipped = (starts | creeps) & self.released  # after a slip each force stays well above the force at the slip
-        self.least = np.where(slipped, np.maximum(self.least, 1.3 * np.minimum(push, self.grip)), self.least)
         ratios, pressing = friction_ratios(self.felt, self.normals), push > 0.5 * MIN_PUSH
         for i in np.flatnonzero(slides & pressing):
             self.friction.update(float(min(ratios[i], 2.0)), float(push[i]), bool(self.slid[i] <= FORCE_LAG))
@@ -212,27 +200,17 @@ class GripHold:
             harder = np.maximum(self.grip, push) * (1 + 240.0 * period * speed.clip(min=0.0))  # twice each 3 mm
             harder = np.where(slides, harder, self.grip)
             self.grip = np.maximum(self.grip, harder * min(1.0, self._enough() / float(harder.sum())))
-        self._release(bool((slides | creeps | ~pressing).any()), period)
+        self._release(bool((slides | (self.creep > 0.002) | ~pressing).any()), period)  # [m/s]
 
     def _release(self, moving: bool, period: float) -> None:
-        """Reduce the forces once the lifted load is steady; when they are low, assume a higher friction coefficient."""
+        """Once the lifted load is steady, reduce forces raised by a slip and the reserve for an unknown weight."""
         if moving or self.weight > 1.05 * self.most:
             self.most, self.steady = max(self.most, self.weight), 0.0
         self.steady += period
         if self.steady < 0.3 or self.weight < LIFTED:
             return
         self.released = True
-        self.grip = np.maximum(self.grip * (1 - min(3.0 * period, 1.0)), np.minimum(self.least, self.grip))
-        self.unfelt *= 1 - min(3.0 * period, 1.0)
-
-    def _reserve(self, contacts: Balance) -> np.ndarray:
-        """Return the normal force [N] that keeps each finger's force in its cone when the object is pushed."""
-        push = PUSH + max(self.unfelt - self.weight, 0.0)
-        turning = np.cross(self.arm, np.eye(3)).T
-        response = (contacts.inverse @ np.concatenate([np.eye(3), turning])).reshape(-1, 3, 3)
-        along = (self.normals[:, None] @ response)[:, 0]
-        across = np.linalg.norm(response - self.normals[:, :, None] * along[:, None], ord=2, axis=(1, 2))
-        return self.cover * push * np.hypot(np.linalg.norm(along, axis=-1), across / self.aim)
+        self.grip, self.unfelt = (x * (1 - min(3.0 * period, 1.0)) for x in (self.grip, self.unfelt))
 
     def _enough(self) -> float:
         """Return an upper bound on the sum of normal forces [N]; larger forces would move the object in the hand."""
@@ -241,7 +219,7 @@ class GripHold:
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
         """Choose the friction coefficient for the forces of the next tick; judge whether the load is too heavy."""
         share, fastest = self.solver.share(self.normals, jacobian), 2.0 * period
-        self.cover = min(max(self.cover + math.copysign(fastest, 0.95 - share), 0.0), 1.0)
+        self.cover = min(max(self.cover + (fastest if share < 0.95 else -4 * fastest), 0.0), 1.0)
         goal = self.friction.high if share > 1.0 and self.cover == 0.0 else self.friction.mean
         self.aim += min(max(goal - self.aim, -fastest), fastest)
         beyond = share > 0.95 and self.cover == 0.0 and bool((self.slid > FORCE_LAG).any())
@@ -262,15 +240,30 @@ class GripHold:
         return wanted + self.trim - (contacts.inverse @ missing).reshape(-1, 3)
 
 
-def _likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
-    """Return the centre [m] of the object in the hand's frame, and the largest weight [N] of an object of its size."""
-    field, points = reference.surface, reference.gains.target
+def push_reserve(contacts: Balance, normals: np.ndarray, arm: np.ndarray, friction: float) -> np.ndarray:
+    """Return the normal force [N] that keeps each finger's force in its cone, for a push of 1 N from the worst side.
+
+    The push acts at `arm` [m] from the middle of the contacts. The fingers share it like springs of equal stiffness.
+    """
+    pushes = np.concatenate([np.eye(3), np.cross(arm, np.eye(3)).T])
+    share = (contacts.inverse @ pushes).reshape(-1, 3, 3)
+    along = np.einsum("fi,fij->fj", normals, share)
+    across = share - normals[:, :, None] * along[:, None]
+    return np.hypot(np.linalg.norm(along, axis=-1), np.linalg.norm(across, ord=2, axis=(1, 2)) / friction)
+
+
+def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
+    """Return the object's centre [m] in the hand's frame and its largest likely weight [N], from what a robot knows.
+
+    The volume is that of the estimated surface, or else of a ball as wide as the contacts.
+    """
+    field, points, density = reference.surface, reference.gains.target, 1000.0  # few things are denser than water
     if field is None or not bool((field.values < 0).any()):
-        return points.mean(0).numpy(), 9.81 * DENSITY * math.pi / 6 * float(torch.cdist(points, points).max()) ** 3
+        return points.mean(0).numpy(), 9.81 * density * math.pi / 6 * float(torch.cdist(points, points).max()) ** 3
     shell, inside = (field.values.abs() < field.spacing).nonzero(), (field.values < 0).nonzero()
-    inside = inside[((inside >= shell.amin(0)) & (inside <= shell.amax(0))).all(-1)]  # far away the sign may be wrong
-    centre = apply(inverse(reference.obj_from_hand), field.origin + field.spacing * inside.double().mean(0)[None])[0]
-    return centre.numpy(), 9.81 * DENSITY * len(inside) * field.spacing**3
+    inside = inside[((inside >= shell.amin(0)) & (inside <= shell.amax(0))).all(-1)]  # farther the sign may be wrong
+    centre = apply(inverse(reference.obj_from_hand), (field.origin + field.spacing * inside.double().mean(0))[None])
+    return centre[0].numpy(), 9.81 * density * len(inside) * field.spacing**3
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:
