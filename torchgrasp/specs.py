@@ -149,9 +149,9 @@ class TrialSpec(Value):
             with equal gains. "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
             "position": PI control to goals behind the contacts. "open_loop": joint motion from pre-grasp to grasp to
             squeeze.
-        holding: how the closed hand presses: "force" (balanced forces), "grip" (least forces for the felt load),
-            "impedance" (the grasp is a spring in the hand), "position" (joint targets are kept) or "law" (Eq. 25
-            continues). In open loop the squeeze is kept.
+        holding: how the closed hand presses: "force" (balanced forces), "grip" (the forces that the felt load and a
+            push of 2.5 N need), "impedance" (the grasp is a spring in the hand), "position" (joint targets are kept) or
+            "law" (Eq. 25 continues). In open loop the squeeze is kept.
         options: components of the closing "uncertainty" or "fixed"; by default all components.
         sensor: sensors of the fingertips; the controller knows their kind.
         max_force: largest normal force [N] of a fingertip; None means no limit.
@@ -164,7 +164,8 @@ class TrialSpec(Value):
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         push: force [N] at the object's centre of mass during the hold, in the world's axes, whose z axis points up.
-        force: desired normal force of the strongest finger [N].
+        force: normal force of the strongest finger [N] in the closing and in the holding "force"; None means 4 N, or
+            `max_force` if it is less. The holding "grip" finds its forces itself.
         noise: whether the sensor is noisy; for a tactile sensor 0.1 N normal, 0.3 N tangential and 1.5 mm of position.
         timestep: timestep of the simulator [s].
         control_rate: rate of the controller [Hz].
@@ -193,7 +194,7 @@ class TrialSpec(Value):
     lift_height: Annotated[float, Range(0.0, 1.0)] = 0.1
     hold_time: Annotated[float, Range(0.0, 60.0)] = 2.0
     shake: Annotated[float, Range(0.0, 0.02)] = 0.0
-    force: Annotated[float, Range(0.01, 100.0)] = 4.0
+    force: Annotated[float, Range(0.01, 100.0)] | None = None
     noise: bool = True
     timestep: Annotated[float, Range(0.0001, 1 / 60)] = 1 / 500
     control_rate: Annotated[float, Range(10.0, 1000.0)] = 100.0
@@ -214,7 +215,7 @@ class TrialSpec(Value):
         """Raise `BadArgument` if fields contradict each other."""
         choose_options(self.closing, self.options)
         check_modes(self.sensor, self.closing, self.holding)
-        if self.max_force is not None and self.force > self.max_force:
+        if self.max_force is not None and self.force is not None and self.force > self.max_force:
             raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
         if self.table_friction is not None and self.table_friction > self.friction:
             raise BadArgument("table_friction", self.table_friction, f"at most friction, {self.friction:g}")
@@ -223,6 +224,11 @@ class TrialSpec(Value):
         if not self.control_rate * self.timestep < 1 + 1e-9:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
+
+    @property
+    def strongest(self) -> float:
+        """The normal force [N] of the strongest finger in the closing and in the holding "force"."""
+        return min(4.0, self.max_force or 4.0) if self.force is None else self.force
 
     @property
     def components(self) -> ClosingOptions:

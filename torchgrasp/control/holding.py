@@ -128,7 +128,7 @@ class GripHold:
         self.felt, self.load, self.carried = np.zeros((len(push), 3)), np.zeros(6), np.zeros(6)
         self.up = None if reference.table is None else reference.table.normal.numpy()
         self.centre, self.unfelt = likely_body(reference)
-        self.friction, self.cover = FrictionEstimate(), 1.0
+        self.friction, self.cover = FrictionEstimate(), 0.0
         self.aim = self.friction.mean
         self.sent, self.trim, self.most = *np.zeros((2, len(push), 3)), 0.0
         self.time = self.steady = self.over = 0.0
@@ -219,7 +219,7 @@ class GripHold:
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
         """Choose the friction coefficient for the forces of the next tick; judge whether the load is too heavy."""
         share, fastest = self.solver.share(self.normals, jacobian), 2.0 * period
-        self.cover = min(max(self.cover + (fastest if share < 0.95 else -4 * fastest), 0.0), 1.0)
+        self.cover = min(max(self.cover + fastest * (2 if share < 0.95 else -4), 0.0), 1.0)
         goal = self.friction.high if share > 1.0 and self.cover == 0.0 else self.friction.mean
         self.aim += min(max(goal - self.aim, -fastest), fastest)
         beyond = share > 0.95 and self.cover == 0.0 and bool((self.slid > FORCE_LAG).any())

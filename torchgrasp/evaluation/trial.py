@@ -96,7 +96,7 @@ class TrialDriver:
                 told = Plane(_rounded(told.normal), round(told.offset, 9))
         if reference is None:
             reference = derive_reference(
-                hand, known, told if spec.table else None, trial.surface, spec.closing, spec.force, spec.kp,
+                hand, known, told if spec.table else None, trial.surface, spec.closing, spec.strongest, spec.kp,
                 spec.sensor, spec.max_force,
             )  # fmt: skip
             reference = dataclasses.replace(reference, obj_from_hand=pose)

@@ -106,8 +106,7 @@ SENSED = {
 FRAGILE = {
     "2 N": Law({"force": 2.0}),
     "2 N, at most": Law({"force": 2.0, "max_force": 2.0}),
-    "2 N, grip": Law({"force": 2.0, "holding": "grip"}),
-    "2 N, grip, at most": Law({"force": 2.0, "max_force": 2.0, "holding": "grip"}),
+    "grip, at most 2 N": Law({"max_force": 2.0, "holding": "grip"}),
 }
 """`DEFAULT` with a light grip, and with an object that bears no more of a fingertip, by name."""
 

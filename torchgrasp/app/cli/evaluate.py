@@ -62,7 +62,9 @@ class Evaluate(_Trials):
     objects: Path = required(OBJECTS_HELP)
     fingers: str = option("default", f'{FINGERS_HELP}; "auto" takes for each view the most likely option to succeed')
     protocol: Protocol = option("dexgraspbench", PROTOCOL_HELP)
-    holding: HoldingMode = option("force", "how the hand presses after closing")
+    holding: HoldingMode | None = option(
+        None, 'how the hand presses after closing; by default as the protocol says, or "force" with --force'
+    )
     force: float | None = option(None, "normal force of the strongest finger [N]; by default as the protocol says")
     displaced: float = option(0.0, "lifts: most that the object is displaced along each axis of the table [m]")
     during: bool = option(False, "displace the object halfway through the approach, not before it")
@@ -86,7 +88,7 @@ class Evaluate(_Trials):
         import_simulator(self.simulator)
         hand, among = load_fingers(self.hand, self.fingers)
         test = self.disturbed(find_protocol(self.protocol))
-        test = test.with_trial(**self.trial(force=self.force, holding=self.holding))
+        test = test.with_trial(**self.trial(force=self.force, holding=self.holding or (self.force and "force")))
         spec = EvaluationSpec(
             self.grasps, self.ranks, self.starts, self.complete, self.only, self.planned is not None, self.seed,
             self.views, among,
