@@ -6,7 +6,8 @@ weight eps of the barrier, the method minimises
     sum n_i + PENALTY sum max(|tau_j| / effort_j - KNEE, 0)^2
         - eps sum [log(mu^2 (n_i - reserve_i)^2 - |t_i|^2) + log(n_i - floor_i)]
 
-over all forces that balance the load. A reserve keeps a force within its cone when a push changes the force. It is written in NumPy, whose calls cost less than torch's for small matrices.
+over all forces that balance the load. A reserve keeps a force within its cone when a push changes the force. It is
+written in NumPy, whose calls cost less than torch's for small matrices.
 """
 
 import math
@@ -136,7 +137,7 @@ class _Barrier:
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
-        """Return the best of g initial coordinates z; if none is feasible, raise the friction, lower floors and reserves."""
+        """Return the best of g initial coordinates z; if none is feasible, raise friction, lower floors and reserves."""
         push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
         across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
         above = (push > floor).all(-1)
