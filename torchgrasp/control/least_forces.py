@@ -137,7 +137,7 @@ class _Barrier:
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
-        """Return the best of g initial coordinates z; if none is feasible, raise friction, lower floors and reserves."""
+        """Return the best of g coordinates z; if none is feasible, raise friction and lower floors and reserves."""
         push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
         across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
         above = (push > floor).all(-1)
