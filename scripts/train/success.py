@@ -1,9 +1,9 @@
 """Fit the model of predicted success, and show its calibration.
 
-Grasps of all ranks are planned on noisy views of authored bodies and pulled: closed in open loop and under uncertainty,
-at two frictions, with and without an error of the pose. One model is fitted to all trials, with a bias for each hand
-and one for errors of the pose. Each kind of body is judged by a fit without it. No scanned object is ever seen, so that
-the ranking of any may be reported.
+Grasps of all ranks are planned on noisy views of authored bodies, pulled and lifted: closed in open loop and under
+uncertainty, at three frictions, with and without an error of the pose. One model is fitted to all trials, with a bias
+for each hand and one for errors of the pose. Each kind of body is judged by a fit without it. No scanned object is
+seen. The shipped weight of the load's force comes from lifts of scanned objects instead: see the model's file.
 """
 
 import json
@@ -48,7 +48,7 @@ def success(
         "pose_error": fitted.pose_error,
         **{key: json.loads(model.read_text("utf-8"))[key] for key in ("range", "range_from")},  # not fitted here
         "fitted_on": f"{len(trials.passed)} trials of {bodies} authored bodies, {passed:.0%} passed",
-        "trial": "torchgrasp.evaluation.pull with 7 N: " + "; ".join(", ".join(test) for test in TESTS),
+        "trial": "torchgrasp.evaluation.pull: " + "; ".join(", ".join(test) for test in TESTS),
         "on_kinds_of_bodies_left_out": {name: round(said[name], 4) for name in ("brier", "skill", "auc", "error")},
     }
     print(write_file(model, format_json(content) + "\n"))

@@ -16,6 +16,7 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_f
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.ik.ranking import (
     FEATURES,
+    carrying_force,
     centred_friction,
     finger_levers,
     is_known,
@@ -25,10 +26,11 @@ from torchgrasp.ik.ranking import (
     success_features,
     success_log_odds,
 )
+from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
 from torchgrasp.values import Contacts, PointCloud, format_success
 
 PADS = real([[0.1, 0.3, 0.2]])
-GOOD = torch.tensor([[4.0, 0.3, -1.0, -0.2]])
+GOOD = torch.tensor([[4.0, 0.3, -1.0, -0.2, 0.5]])
 WORSE = {"log-odds of closure": -2.0, "log of the stiffest finger's lever over 70 mm, at most": -0.5}
 RADIUS = 0.04
 
@@ -73,6 +75,30 @@ def test_the_arm_of_a_load_is_about_the_longest_side_of_the_best_three_in_any_fr
     turn = rotation_from_vector(real([0.3, -1.0, 2.0]))
     torch.testing.assert_close(load_arm(points[:, [2, 0, 1]] @ turn.T + 1.0, turn @ center + 1.0), found)
     assert load_arm(points[:0], center).shape == (0,)
+
+
+@pytest.mark.parametrize("push", [0.0, 2.0])
+def test_the_force_that_carries_a_load_is_the_least_with_which_no_contact_slides(push, generator):
+    normals = triple().normals.expand(40, 3, 3)
+    points = 0.06 * normals + 0.05 * torch.randn(40, 3, 3, generator=generator, dtype=torch.float64)
+    load, center = real([0.5, 0.3, -2.0]), real([0.01, 0.0, -0.02])
+    balanced = least_friction_forces(points, normals)
+    found = carrying_force(Contacts(points, normals), balanced, center, 0.8, load, push)
+    pushes = push * unit(torch.randn(4000 if push else 1, 3, generator=generator, dtype=torch.float64)).numpy()
+    ratio = tangential_ratio(balanced, normals).amax(-1).nan_to_num(torch.inf)
+    assert bool(torch.isinf(found[ratio > 0.81]).all()) and int((ratio < 0.75).sum()) > 5
+    for p, n, f, s in zip(*(x[ratio < 0.75].numpy() for x in (points, normals, balanced, found)), strict=True):
+        wrench = np.hstack([np.vstack([np.eye(3), np.cross(x, np.eye(3)).T]) for x in p - center.numpy()])
+        loads = np.pad(load.numpy() + pushes, ((0, 0), (0, 3)))
+        shared = -np.linalg.lstsq(wrench, loads.T, rcond=None)[0].T.reshape(-1, 3, 3)
+
+        def slides(factor, f=f, n=n, shared=shared):
+            """Whether a contact slides under one of the loads."""
+            force = factor * f + shared
+            press = -(force * n).sum(-1)
+            return bool((np.linalg.norm(force + press[..., None] * n, axis=-1) > 0.8 * press).any())
+
+        assert slides(0.97 * s) and not slides(1.03 * s)
 
 
 @pytest.mark.parametrize("name", FEATURES)
@@ -150,7 +176,7 @@ def test_equal_springs_in_all_joints_yield_by_the_square_of_the_lever(name):
 def test_features_of_a_ball_by_hand(ball):
     contacts, center = around(0.01), real([0.0, 0.0, -0.02])
     hand, grasp = held(contacts)
-    closure, least, arm, lever = success_features(hand, ball, grasp, center, 0.5, seed=3)[0].tolist()
+    closure, least, arm, lever, _ = success_features(hand, ball, grasp, center, 0.5, seed=3)[0].tolist()
     cone = math.atan(0.5)
     closed = closure_probability(ball, contacts, ContactSpec(friction=0.5), n=600, seed=3).probability
     assert closure == pytest.approx(float(torch.logit(closed, eps=1e-3)))
@@ -160,6 +186,9 @@ def test_features_of_a_ball_by_hand(ball):
     gaps = [gap / np.linalg.norm(p[2] - p[1]) for gap in gaps]
     assert arm == pytest.approx(math.log(gaps[0] / (gaps[1] + 0.01) + 0.1))
     assert lever == pytest.approx(math.log((min(float(finger_levers(hand, grasp).min()), 0.07) + 0.01) / 0.08))
+    forces = least_friction_forces(contacts.points, contacts.normals, 1.0)
+    carried = success_features(hand, ball, grasp, center, 0.8)[0, 4]
+    assert carried == pytest.approx(math.log(carrying_force(contacts, forces, center, 0.4, real([0, 0, -1.0]))))
 
 
 def test_features_do_not_depend_on_the_frame_and_rows_do_not_on_each_other(ball):
@@ -171,7 +200,8 @@ def test_features_do_not_depend_on_the_frame_and_rows_do_not_on_each_other(ball)
     here = success_features(hand, ball, grasps, center, 0.6)
     there = Contacts(apply(moved_from_obj, both.points), both.normals @ turn.T)
     moved, at = held(there, moved_from_obj)[1], apply(moved_from_obj, center[None])[0]
-    again = success_features(hand, ball.moved(moved_from_obj), moved, at, 0.6)
+    down = tuple((-turn[:, 2]).tolist())
+    again = success_features(hand, ball.moved(moved_from_obj), moved, at, 0.6, weight=down)
     near(again[:, 1:], here[:, 1:], 1e-3)
     near(torch.sigmoid(again[:, 0]), torch.sigmoid(here[:, 0]), 0.06)  # other draws
     near(success_features(hand, ball, grasps[1:], center, 0.6), here[1:], 1e-9)

@@ -166,6 +166,15 @@ def test_least_grip_is_none_for_fingers_on_one_side_and_for_weak_drives():
         assert (least_grip(PINCH, outward, UP, 0.8, torques) is not None) is held
 
 
+def test_two_fingers_hold_a_load_beside_their_line_by_the_torque_of_their_patches_alone():
+    points, normals = PINCH[:2], PINCH[:2] / 0.03
+    load = UP + torch.tensor([0.0, 0.0, 0.0, 0.016, 0.0, 0.0])
+    assert least_grip(points, normals, load, 0.5) is None
+    forces = least_grip(points, normals, load, 0.5, patch=0.005)
+    assert forces is not None
+    assert float(-(forces * normals).sum()) == pytest.approx(0.016 / (0.5 * 0.005))
+
+
 @pytest.mark.parametrize("spread", [0.4, 1.1])
 def test_fit_factor_is_the_spread_of_normal_errors(spread: float):
     generator = np.random.default_rng(0)

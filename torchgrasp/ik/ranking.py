@@ -17,11 +17,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.geometry.frames import apply, inverse, rotate, skew
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
+from torchgrasp.plan.closure import cone_edges, tangents
 from torchgrasp.plan.closure_probability import closure_share
-from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
+from torchgrasp.plan.forces import grasp_map, least_friction_forces, tangential_ratio
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values import Contacts, Grasps
 
@@ -30,6 +31,7 @@ FEATURES = (
     "least friction angle of a balance over that of friction",
     "log of the load's arm over the triangle's height",
     "log of the stiffest finger's lever over 70 mm, at most",
+    "log of the strongest finger's force that carries the load, over the load",
 )
 """The features of the model of success, in this order."""
 LEAST_ARM = 0.1  # added to the load's arm over the triangle's height, so that its logarithm is finite
@@ -89,6 +91,29 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
     return arm / (height + 0.01)  # [m], the lever of torsion
 
 
+def carrying_force(
+    contacts: Contacts, forces: Float[Tensor, "b f 3"], center: Float[Tensor, "3"], friction: float,
+    load: Float[Tensor, "3"], push: float = 0.0,
+) -> Float[Tensor, "b"]:  # fmt: skip
+    """Return the least factor s on balanced forces f_0 so that all contacts stick under a load and any push [N].
+
+    Load and push of any direction act at `center`; w is their wrench. Equal springs share it, G being the grasp map:
+
+        f = s f_0 - G^+ w,    y . f >= 0 for all edges y of the cones dual to the friction cones.
+
+    The factor is infinite if the forces do not stick at all, as where no forces balance.
+    """
+    points, normals = contacts.points.to(forces), contacts.normals.to(forces)
+    dual = cone_edges(normals, tangents(points, normals), 1.0, edges=32) + (1 - friction) * normals[:, :, None]
+    moment = skew(center.to(forces) - points.mean(1))  # maps a force at `center` to its torque
+    eye = torch.eye(3).to(forces).expand_as(moment)
+    shared = (torch.linalg.pinv(grasp_map(points)) @ torch.cat([eye, moment], 1)).unflatten(1, points.shape[1:])
+    across = torch.einsum("bfij,bfei->bfej", shared, dual)
+    lacking = across @ load.to(forces) + push * torch.linalg.vector_norm(across, dim=-1)
+    having = torch.einsum("bfi,bfei->bfe", forces, dual)
+    return torch.where(having > 0, lacking.clamp_min(0) / having, torch.inf).amax((1, 2))
+
+
 def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
     """Return each finger's lever [m]: the norm of its joints' moment arms for a force along the contact's normal.
 
@@ -102,9 +127,13 @@ def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
 
 
 def success_features(
-    hand: Hand, shape: ShapeGP, grasps: Grasps, center: Float[Tensor, "3"], friction: float, seed: int = 0
-) -> Float[Tensor, "g k"]:
-    """Return the success model's inputs `FEATURES` for each grasp; `center` [m] is the estimated centre of mass."""
+    hand: Hand, shape: ShapeGP, grasps: Grasps, center: Float[Tensor, "3"], friction: float, seed: int = 0,
+    weight: tuple[float, float, float] = (0.0, 0.0, -1.0),
+) -> Float[Tensor, "g k"]:  # fmt: skip
+    """Return the success model's inputs `FEATURES` for each grasp; `center` [m] is the estimated centre of mass.
+
+    `weight` is the direction of gravity; a zero vector means that it is unknown.
+    """
     contacts = grasps.contacts
     points, normals = contacts.points.to(shape.x), contacts.normals.to(shape.x)
     center = center.to(points)
@@ -115,7 +144,10 @@ def success_features(
     least_lever = finger_levers(hand, grasps).amin(1).to(points)
     free, straight = 0.07, 0.01  # [m] more lever is no better; keeps the logarithm of a straight finger finite
     lever = torch.log((least_lever.clamp_max(free) + straight) / (free + straight))
-    return torch.stack([closure, least / math.atan(friction), arm, lever], dim=-1)
+    push = 0.0 if any(weight) else 1.0
+    carried = carrying_force(contacts, forces, center, 0.5 * friction, center.new_tensor(weight), push)
+    carried = torch.log(carried.clamp(0.3, 100.0)).to(points)
+    return torch.stack([closure, least / math.atan(friction), arm, lever, carried], dim=-1)
 
 
 @functools.cache

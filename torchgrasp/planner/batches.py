@@ -185,7 +185,8 @@ def rank(problem: Problem, solved: Grasps) -> Grasps:
         buried = torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)
         solved = dataclasses.replace(solved, status=buried)
     good = solved[solved.status == Status.OK]
-    features = success_features(hand, problem.shape, good, problem.center, problem.spec.friction, request.seed)
+    weight = (0.0, 0.0, 0.0 if problem.spec.plane is None else -1.0)
+    features = success_features(hand, problem.shape, good, problem.center, problem.spec.friction, request.seed, weight)
     log_odds = success_log_odds(features, hand.name)
     if problem.obstacles is not None:
         free = 1 - collision_probability(hand, good, problem.obstacles).to(log_odds)

@@ -90,6 +90,7 @@ def least_grip(
     load: Float[Tensor, "6"],
     friction: float,
     torques: Float[Tensor, "f j 3"] | None = None,
+    patch: float = 0.0,
 ) -> Float[Tensor, "f 3"] | None:
     """Return the forces with the least sum of normal forces that balance a load, or None where there are none.
 
@@ -99,6 +100,7 @@ def least_grip(
         load: force [N] and torque about the mean of the contacts [N m] that the forces must sum to.
         friction: at every contact.
         torques: joint torques, over their limits, of a force of 1 N along each axis; None: without limit.
+        patch: radius of the contacts [m], which add a torque about the normal of at most friction x force x patch.
     """
     p, n, f = points.double().numpy(), normals.double().numpy(), len(points)
     side = np.cross(n, np.eye(3)[np.abs(n).argmin(1)])
@@ -112,13 +114,17 @@ def least_grip(
     arms = p - p.mean(0)
     wrench = np.concatenate([np.tile(np.eye(3), f), np.concatenate([np.cross(arm, np.eye(3)).T for arm in arms], 1)])
     size = np.repeat([1.0, 1 / max(float(np.ptp(p, axis=0).max()), 1e-6)], 3)  # forces and torques alike
-    limits = {}
+    spin = np.pad(n, ((0, 0), (3, 0))).T  # wrench of 1 N m about each normal
+    room = friction * patch * np.kron(np.eye(f), np.ones(EDGES))
+    limit, most = np.block([[-room, np.eye(f)], [-room, -np.eye(f)]]), np.zeros(2 * f)
     if torques is not None:
         share = np.concatenate(list(torques.double().numpy()), axis=1) @ columns
-        limits = {"A_ub": np.concatenate([share, -share]), "b_ub": np.ones(2 * len(share))}
-    balance, wanted = size[:, None] * (wrench @ columns), size * load.double().numpy()
-    found = linprog(np.ones(f * EDGES), A_eq=balance, b_eq=wanted, **limits)
-    return torch.from_numpy((columns @ found.x).reshape(f, 3)) if found.status == 0 else None
+        share = np.pad(np.concatenate([share, -share]), ((0, 0), (0, f)))
+        limit, most = np.concatenate([limit, share]), np.append(most, np.ones(len(share)))
+    balance, wanted = size[:, None] * np.concatenate([wrench @ columns, spin], 1), size * load.double().numpy()
+    cost, bounds = np.repeat([1.0, 0.0], [f * EDGES, f]), [(0, None)] * (f * EDGES) + [(None, None)] * f
+    found = linprog(cost, limit, most, balance, wanted, bounds)
+    return torch.from_numpy((columns @ found.x[: f * EDGES]).reshape(f, 3)) if found.status == 0 else None
 
 
 def least_grip_at(
