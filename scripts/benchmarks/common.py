@@ -40,6 +40,7 @@ class Options:
         starts: random starts of the contact planner.
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
         draws: trials of each grasp of close/table-lift, with other displacements, pushes and noise.
+        tries: largest number of grasps that a trial of close/table-lift tries; by default as the protocol says.
         planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they are planned and kept.
         simulator: of load/trials and close/table-lift.
         workers: processes that share the trials.
@@ -60,6 +61,7 @@ class Options:
     starts: int = 1000
     scale: float = 1.0
     draws: int = 5
+    tries: int | None = None
     planned: Path | None = None
     simulator: Literal["sapien", "mujoco"] = "sapien"
     workers: int = 1

@@ -12,6 +12,7 @@ from typing import Any
 from paper.tables6_7 import format_points
 
 from benchmarks.common import Options, Row, bench
+from torchgrasp.app.report.evaluation import list_causes
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, PoseNoise, Protocol, ViewScore, evaluate, summarise
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
 from torchgrasp.hand.hand import Hand
@@ -24,6 +25,8 @@ BARS: dict[str, tuple[dict[str, Any], float, float]] = {
     "moved by up to 3 cm": ({"noise": PoseNoise(0.03)}, 0.93, 0.0),
     "moved by up to 5 cm": ({"noise": PoseNoise(0.05)}, 0.85, 0.0),
     "moved by up to 5 cm in the approach": ({"noise": PoseNoise(0.05), "displaced": "approach"}, 0.85, 0.0),
+    "moved by up to 3 cm, seen again": ({"noise": PoseNoise(0.03), "relook": True}, 0.93, 0.0),
+    "moved by up to 5 cm, seen again": ({"noise": PoseNoise(0.05), "relook": True}, 0.85, 0.0),
     "pushed with 2.5 N": ({"push": 2.5}, 0.95, 0.0),
 }
 """Conditions by name: changes of the protocol, and the project's bars for the shares risen and held without slip."""
@@ -38,7 +41,7 @@ LEAST_AGREED, MOST_APART = 0.95, 0.02
 @bench("close/table-lift", objects=True)
 def table_lift(o: Options) -> list[Row]:
     """Lift every object in each condition, with each hand."""
-    names = [name for name in o.conditions or (*BARS, SIMULATORS) if name in BARS or name == SIMULATORS]
+    names = o.conditions or (*BARS, SIMULATORS)
     rows = list[Row]()
     for hand in map(load_hand, o.hands):
         lift = functools.partial(_lift, o, hand)
@@ -55,8 +58,8 @@ def table_lift(o: Options) -> list[Row]:
 
 def _lift(o: Options, hand: Hand, protocol: Protocol, simulator: str, grasps: int) -> list[ViewScore]:
     """Return the scores of the objects under a protocol, with saved grasps, or with new ones that are then kept."""
-    noise = dataclasses.replace(protocol.noise, draws=o.draws)
-    protocol = dataclasses.replace(protocol, noise=noise).with_trial(simulator=simulator)
+    noise, tries = dataclasses.replace(protocol.noise, draws=o.draws), o.tries or protocol.tries
+    protocol = dataclasses.replace(protocol, noise=noise, tries=tries).with_trial(simulator=simulator)
     found = []
     for folder in o.objects:
         shelf = o.planned or o.out / "table-lift" / f"{hand.name}_{folder.name}"
@@ -74,19 +77,13 @@ def _row(what: str, scores: Sequence[ViewScore], least: float, strict: float) ->
     """Return the shares that rose and that were held without slip, refusals, and causes."""
     risen, held = summarise(scores), summarise([_strict(score) for score in scores])
     words = [format_share(risen["top1"]), f"without slip {format_share(held['top1'])}"]
-    words += [f"{risen['refused']} of {len(scores)} refused"]
-    words += [f"{x['count']} {cause} ({_sizes(x)})" for cause, x in risen["causes"].items()]
+    words += [f"by the first grasp and further ones {risen['tries']}", f"{risen['refused']} of {len(scores)} refused"]
+    words += [f"{cause} {text}" for cause, text in list_causes(risen)]
     bar = f">= {least:.0%}" + (f", without slip >= {strict:.0%}" if strict else "")
     met = risen["top1"].value >= least and held["top1"].value >= strict
     lost = [(x.object, a.draw, a.status.name, a.cause, a.size) for x in scores for a in x.attempts if not a.held]
     numbers = {"risen": risen["top1"], "held": held["top1"], "causes": risen["causes"], "not held": lost}
     return Row(what, bar, "; ".join(words), met, numbers)
-
-
-def _sizes(cause: dict[str, Any]) -> str:
-    """Return the median size of a cause, and its counts by group."""
-    groups = [f"{n} {group}" for group, n in cause["by_group"].items() if group]
-    return ", ".join([f"median {cause['median']:.0f}", *groups])
 
 
 def _strict(score: ViewScore) -> ViewScore:

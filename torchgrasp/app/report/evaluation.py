@@ -130,7 +130,7 @@ def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = []
     for name, found in summary["causes"].items():
         groups = ", ".join(f"{n} {group}" for group, n in found["by_group"].items() if group)
-        size = f"median {found['median']:.0f} {CAUSES[name][0]}"
+        size = f"median {found['median']:.3g} {CAUSES[name][0]}"
         rows.append((name, f"{found['count']}{groups and f' ({groups})'}, {size}"))
     return rows
 
