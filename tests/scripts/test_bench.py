@@ -15,6 +15,7 @@ from bench import SUBJECTS
 from benchmarks.close.conditions import CONDITIONS, draw_solid
 from benchmarks.close.holding import EDGES, least_grip
 from benchmarks.close.misplaced import _misplace, median_over
+from benchmarks.close.statics import can_hold, true_contacts
 from benchmarks.common import Options, benches_of, measure
 from benchmarks.gpu.compare import bench_kernel
 from benchmarks.gpu.kernels import kernels
@@ -173,6 +174,17 @@ def test_two_fingers_hold_a_load_beside_their_line_by_the_torque_of_their_patche
     forces = least_grip(points, normals, load, 0.5, patch=0.005)
     assert forces is not None
     assert float(-(forces * normals).sum()) == pytest.approx(0.016 / (0.5 * 0.005))
+
+
+def test_contacts_on_the_true_surface_hold_a_cylinder_unless_it_is_heavy_on_one_side():
+    hand, (_, grasp) = "barrett", pinch("barrett")
+    points, normals = true_contacts(grasp, cylinder())
+    np.testing.assert_allclose(points, grasp.contacts.points[0], atol=2e-3)  # a polygon of 32 sides
+    assert float((torch.from_numpy(normals) * grasp.contacts.normals[0]).sum(-1).min()) > 0.99
+    assert can_hold(grasp, cylinder(), hand) == (True, True)
+    lopsided = cylinder()
+    lopsided.center_mass = [2.0, 0.0, 0.1]
+    assert can_hold(grasp, lopsided, hand) == (False, False)
 
 
 @pytest.mark.parametrize("spread", [0.4, 1.1])
