@@ -124,7 +124,7 @@ class GripHold:
         self.solver = LeastForces(forces.numpy().copy(), effort, max_force)
         push = np.abs((forces.numpy() * self.normals).sum(-1))
         self.planned = np.maximum(push, 0.01 * max(float(push.max()), MIN_PUSH))
-        self.grip = np.zeros(len(push))
+        self.grip = np.minimum(push, max_force)  # the closing has pressed so hard
         self.felt, self.load, self.carried = np.zeros((len(push), 3)), np.zeros(6), np.zeros(6)
         self.up = None if reference.table is None else reference.table.normal.numpy()
         self.centre, self.unfelt = likely_body(reference)
@@ -151,14 +151,15 @@ class GripHold:
         step = self._command(contacts, wanted, period) - self.sent
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         self.sent = self.sent + step * np.minimum(1.0, fastest_rise * period / np.maximum(length, 1e-9))
-        torque = np.einsum("cij,ci->j", jacobian, self.sent).clip(-self.solver.effort, self.solver.effort)
+        torque = np.einsum("cij,ci->j", jacobian, self.sent)
+        torque /= max(1.0, float((np.abs(torque) / self.solver.effort).max()))
         share = min(self.time / RAMP, 1.0)
         lead = torch.from_numpy(torque) / self.reference.kp
         return self.start + share * (self.rest + lead - self.start)
 
     def _floor(self) -> np.ndarray:
         """Return the least allowed normal force [N] of each finger; it leaves room below the largest allowed force."""
-        floor = np.maximum(self.grip, MIN_PUSH)
+        floor = np.maximum(self.cover * self.grip, MIN_PUSH)
         largest = float((floor / self.planned).max() * self.planned.max())
         return floor * min(1.0, 0.8 * self.solver.most / largest)
 
@@ -185,7 +186,7 @@ class GripHold:
         return np.concatenate([lifted * self.up, torque])
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """Press harder where a finger slides, update the friction estimate, and reduce forces that are not needed."""
+        """Update the friction estimate by sliding fingers, and reduce forces that are not needed."""
         speed, sliding = observation.tactile.sliding.numpy(), 0.008  # [m/s]
         self.creep = self.creep + low_pass(1.0, period) * (speed.clip(max=sliding) - self.creep)
         slides = (speed > sliding) & observation.tactile.contact.numpy()
@@ -196,14 +197,10 @@ class GripHold:
         ratios, pressing = friction_ratios(self.felt, self.normals), push > 0.5 * MIN_PUSH
         for i in np.flatnonzero(slides & pressing):
             self.friction.update(float(min(ratios[i], 2.0)), float(push[i]), bool(self.slid[i] <= FORCE_LAG))
-        if slides.any():
-            harder = np.maximum(self.grip, push) * (1 + 240.0 * period * speed.clip(min=0.0))  # twice each 3 mm
-            harder = np.where(slides, harder, self.grip)
-            self.grip = np.maximum(self.grip, harder * min(1.0, self._enough() / float(harder.sum())))
         self._release(bool((slides | (self.creep > 0.002) | ~pressing).any()), period)  # [m/s]
 
     def _release(self, moving: bool, period: float) -> None:
-        """Once the lifted load is steady, reduce forces raised by a slip and the reserve for an unknown weight."""
+        """Once the lifted load is steady, reduce the forces of the closing and the reserve for an unknown weight."""
         if moving or self.weight > 1.05 * self.most:
             self.most, self.steady = max(self.most, self.weight), 0.0
         self.steady += period
@@ -211,10 +208,6 @@ class GripHold:
             return
         self.released = True
         self.grip, self.unfelt = (x * (1 - min(3.0 * period, 1.0)) for x in (self.grip, self.unfelt))
-
-    def _enough(self) -> float:
-        """Return an upper bound on the sum of normal forces [N]; larger forces would move the object in the hand."""
-        return 3.0 * (self.weight + PUSH) / self.friction.mean
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
         """Choose the friction coefficient for the forces of the next tick; judge whether the load is too heavy."""
