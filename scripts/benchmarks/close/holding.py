@@ -1,10 +1,12 @@
-"""Holding what one cannot know: the true mass, a friction that nobody told, and what statics say of it.
+"""Holding what one cannot know: the true mass, a friction that nobody told, a push, and what statics say of it.
 
-The best grasp of one view of each object is lifted with every holding and friction. Static analysis at the contacts
-there are when the hand has pressed says whether its drives could hold the object, and at the end what would suffice.
+The best grasp of one view of each object is lifted with every holding and friction, and is pushed or not. Static
+analysis at the contacts there are when the hand has pressed says whether its drives could hold the object, and at the
+end what would suffice for the weight and a push from the worst side.
 """
 
 import dataclasses
+import itertools
 import math
 import statistics
 from collections import Counter
@@ -27,7 +29,7 @@ from torchgrasp.closure import ClosureResult
 from torchgrasp.control.tactile import joint_jacobian
 from torchgrasp.evaluation import close_hand
 from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
-from torchgrasp.evaluation.protocols import seed_of
+from torchgrasp.evaluation.protocols import draw_push, seed_of
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -35,10 +37,17 @@ from torchgrasp.hand.load import load_hand
 FRICTIONS = (0.4, 0.7, 1.0)
 """Frictions that the hand does not know."""
 
-HOLDINGS = {"force": 4.0, "grip": 4.0}
-"""Holdings by name, and the force [N] with which they press at first."""
+HOLDINGS: dict[str, dict[str, Any]] = {
+    "force, 4 N": {"holding": "force", "force": 4.0},
+    "force, 6 N": {"holding": "force", "force": 6.0},
+    "grip": {"holding": "grip", "force": None},
+}
+"""Changes of the trial by the name of the holding."""
 
-LEAST_HELD, MOST_SPENT = 0.92, 1.3
+PUSHES = (0.0, 2.5)
+"""Forces [N] that push the lifted object."""
+
+LEAST_HELD, MOST_SPENT = 0.92, 1.5
 """The project's bars: share held of what can be held, and force over what suffices."""
 
 HOLD_TIME = 4.0
@@ -52,14 +61,16 @@ def holding(o: Options) -> list[Row]:
     for hand in spec.hands:
         tasks = [(spec, subject, hand) for subject in subjects(spec)]
         lifts = [lift for found in run_all(hold_object, tasks, spec.workers) for lift in found]
-        base = [x for x in lifts if x["holding"] == "force"]
-        rows += [_row(hand, name, [x for x in lifts if x["holding"] == name], base) for name in HOLDINGS]
+        for push, name in itertools.product(PUSHES, HOLDINGS):
+            some = [x for x in lifts if x["push"] == push]
+            mine, base = ([x for x in some if x["holding"] == y] for y in (name, next(iter(HOLDINGS))))
+            rows.append(_row(f"{hand}, pushed" if push else hand, name, mine, base))
     return rows
 
 
 def hold_object(spec: TableSpec, subject: Subject, hand: str) -> list[dict[str, Any]]:
     """Return the lifts of one object, kept or run."""
-    path = spec.kept("holding", f"{hand}_{subject.label}", HOLDINGS, FRICTIONS, HOLD_TIME).with_suffix(".json")
+    path = spec.kept("holding", f"{hand}_{subject.label}", HOLDINGS, FRICTIONS, PUSHES, HOLD_TIME).with_suffix(".json")
     return keep(path, lambda: list(_lift(spec, subject, hand)))
 
 
@@ -67,16 +78,19 @@ def _lift(spec: TableSpec, subject: Subject, hand_name: str) -> Iterator[dict[st
     """Lift the best grasp of the first view."""
     hand, (mesh, parts, mass, view) = load_hand(hand_name), read_solid(subject)
     grasps = plan_view(spec, subject, hand_name, HOUSEHOLD.trial.friction)
-    for friction in FRICTIONS if grasps else ():
+    for friction, push in itertools.product(FRICTIONS, PUSHES) if grasps else ():
         seed = seed_of(spec.seed, subject.label, view, str(friction))
-        for name, force in HOLDINGS.items():
-            changes = {"holding": name, "force": force, "mass": mass, "friction": friction, "hold_time": HOLD_TIME}
+        force = draw_push(push, seed)
+        for name, law in HOLDINGS.items():
+            changes = law | {"mass": mass, "friction": friction, "hold_time": HOLD_TIME, "push": force}
             done = close_hand(grasps[0], hand, mesh, dataclasses.replace(HOUSEHOLD.trial, **changes), seed, parts=parts)
             told = {"object": subject.label, "family": subject.family, "holding": name, "friction": friction}
-            told |= {"mass": mass, "status": done.status.name, "slip": done.slip.distance, "turn": done.slip.angle}
+            told |= {"push": push, "mass": mass, "status": done.status.name}
+            told |= {"slip": done.slip.distance, "turn": done.slip.angle}
             pressed = int((done.time <= done.phases[2]).sum()) - 1
-            for when, tick in (("pressed", pressed), ("end", len(done.time) - 1)):
-                told[when] = least_grip_at(done, tick, hand, mesh, mass, friction) if tick >= 0 else (None, 0.0)
+            for when, tick, most in (("pressed", pressed, push), ("end", len(done.time) - 1, PUSHES[-1])):
+                found = least_grip_at(done, tick, hand, mesh, mass, friction, most) if tick >= 0 else (None, 0.0)
+                told[when] = found
             yield told
 
 
@@ -128,11 +142,13 @@ def least_grip(
 
 
 def least_grip_at(
-    closure: ClosureResult, tick: int, hand: Hand, mesh: trimesh.Trimesh, mass: float, friction: float
-) -> tuple[float | None, float]:
+    closure: ClosureResult, tick: int, hand: Hand, mesh: trimesh.Trimesh, mass: float, friction: float,
+    push: float = 0.0,
+) -> tuple[float | None, float]:  # fmt: skip
     """Return the least normal sum [N] that could hold the object at a tick of a trial, and the simulated sum.
 
-    None: the drives cannot hold the object, or fewer than two fingers touch it.
+    It carries the weight and a `push` [N] at the centre of mass, from the worst of 26 sides. None: the drives cannot
+    hold the object, or fewer than two fingers touch it.
     """
     hand, trace = hand.to("cpu", torch.float64), closure.trace
     touching = torch.isfinite(trace.points[tick]).all(-1)
@@ -145,11 +161,17 @@ def least_grip_at(
     points = torch.where(touching[:, None], trace.points[tick], 0.0)
     jacobian = joint_jacobian(hand, closure.joints[tick][places], points)[touching]
     effort = torch.tensor([hand.actuators[name].effort for name in hand.tree.joint_names], dtype=torch.float64)
-    force = mass * 9.81 * closure.hand_pose[tick][:3, :3].T @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    points, normals = points[touching], trace.normals[tick][touching]
-    load = torch.cat([force, torch.linalg.cross(centre - points.mean(0), force)])
-    forces = least_grip(points, normals, load, friction, jacobian.mT / effort[:, None])
-    return (None if forces is None else float(-(forces * normals).sum())), spent
+    weight = mass * 9.81 * closure.hand_pose[tick][:3, :3].T @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    points, normals, least = points[touching], trace.normals[tick][touching], 0.0
+    for side in itertools.product((-1.0, 0.0, 1.0), repeat=3) if push else [(0.0, 0.0, 0.0)]:
+        away = torch.tensor(side, dtype=torch.float64)
+        force = weight + push * away / max(float(away.norm()), 1.0)
+        load = torch.cat([force, torch.linalg.cross(centre - points.mean(0), force)])
+        forces = least_grip(points, normals, load, friction, jacobian.mT / effort[:, None])
+        if forces is None:
+            return None, spent
+        least = max(least, -float((forces * normals).sum()))
+    return least, spent
 
 
 def _row(hand: str, name: str, lifts: Sequence[dict[str, Any]], base: Sequence[dict[str, Any]]) -> Row:
@@ -168,6 +190,6 @@ def _row(hand: str, name: str, lifts: Sequence[dict[str, Any]], base: Sequence[d
     words = f"{format_share(share)}, change {format_points(change)}; lost {lost}"
     words += f"; of what cannot be held {others}; force {most:.2f}x of what suffices"
     bar, met = f">= {LEAST_HELD:.0%} of what can be held, <= {MOST_SPENT}x", share.value >= LEAST_HELD
-    bar, met = ("-", None) if name == "force" else (bar, met and most <= MOST_SPENT)
+    bar, met = (bar, met and most <= MOST_SPENT) if name == "grip" else ("-", None)
     numbers = {"share": share, "change": change, "spent": most, "lost": lost, "rest": others}
     return Row(f"held by holding {name}, {hand}", bar, words, met, numbers)
