@@ -1,6 +1,8 @@
 """Options of contact planning and of simulated trials, with units, ranges and defaults."""
 
 import dataclasses
+import math
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from torchgrasp.base import FINGERTIPS, Value
@@ -16,6 +18,8 @@ TIP_RADIUS, SEPARATION = 0.012, 0.026
 """Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind smaller fingertips."""
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
 """Radii [m] within which the surface at a contact must be flat; the largest that the object allows is used."""
+RIM = 0.001
+"""Such a radius [m] on the upper rim of an object too low for contacts on its walls."""
 
 
 @checked
@@ -90,8 +94,15 @@ class ContactSpec(Value):
 
     @property
     def least_height(self) -> float:
-        """The least height [m] of a vertical wall that a fingertip above the table can touch."""
-        return self.fingertip_radius + (FLAT_RADII[-1] if self.flat_radius is None else self.flat_radius)
+        """The least height [m] of an object that fingertips on the table can touch: on its wall, or on its upper rim.
+
+        A rim of radius q touches a fingertip of radius r at a height h with the normal's slope s, h = (r + q)(1 - s). No
+        wall but a rim counts if `flat_radius` is not given; then q is the least of `FLAT_RADII`.
+        """
+        if self.flat_radius is not None:
+            return self.fingertip_radius + self.flat_radius
+        slope = math.sin(math.atan(self.friction * math.cos(math.pi / self.edges)))
+        return (self.fingertip_radius + FLAT_RADII[-1]) * (1 - slope)
 
     @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
@@ -102,6 +113,23 @@ class ContactSpec(Value):
         (0.015, 0.0)
         """
         return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
+
+    @checked
+    def relaxed(self, below: float, radius: float) -> "Iterator[ContactSpec]":
+        """Yield specs for an object without contacts: smaller flat areas than `below` [m], then the upper rim.
+
+        A fingertip on the table touches the rim of a low object with an inclined normal. The estimated rim is rounder
+        than the true one, so its normals are steeper. Therefore the margins of friction and of the fingertips' `radius`
+        [m] are spent step by step.
+        """
+        if self.flatness is None or self.flat_radius is not None:
+            return
+        yield from (dataclasses.replace(self, flat_radius=flat) for flat in FLAT_RADII if flat < below)
+        widest = self.for_fingertips(radius).fingertip_radius
+        for spent in (0.0, 0.5, 1.0) if self.table is not None else ():
+            tips = widest + spent * (radius - widest) if self.tip_radius is None and radius > 0 else self.tip_radius
+            margin = self.friction_margin + spent * (1 - self.friction_margin)
+            yield dataclasses.replace(self, flat_radius=RIM, tip_radius=tips, friction_margin=margin)
 
     @classmethod
     @checked

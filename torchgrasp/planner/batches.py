@@ -26,7 +26,7 @@ from torchgrasp.plan.starts import check_starts
 from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
 from torchgrasp.planner.problem import Problem, ignore
 from torchgrasp.shape.values import surface_deviation
-from torchgrasp.specs import FLAT_RADII, Ranking
+from torchgrasp.specs import Ranking
 from torchgrasp.values import ContactPlan, Grasps, format_success
 
 FIRST, GROWTH = 8, 6
@@ -59,17 +59,17 @@ def schedule(starts: int, most: int) -> list[Batch]:
 
 
 def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
-    """Yield the grasps of each batch, as `Planner.run`; if none is executable, plan contacts on smaller flat areas.
+    """Yield the grasps of each batch, as `Planner.run`; if none is executable, plan with relaxed constraints.
 
     A contact set must be flat within the largest of `FLAT_RADII` that the object allows, which can leave few contacts.
-    The failed grasps are those of the last radius.
+    The failed grasps are those of the last constraints (`ContactSpec.relaxed`).
     """
     failed, given = list[Grasps](), problem.given_spec
-    radii = FLAT_RADII if given.flatness is not None and given.flat_radius is None else ()
-    for radius in (None, *(radius for radius in radii if radius < problem.spec.ring_radius)):
+    relaxed = given.relaxed(problem.spec.ring_radius, float(problem.hand.tips.radius.max()))
+    for spec in (given, *relaxed):
         failed.clear()
-        if radius is not None:
-            problem = dataclasses.replace(problem, given_spec=dataclasses.replace(given, flat_radius=radius))
+        if spec is not given:
+            problem = dataclasses.replace(problem, given_spec=spec)
         batches = Planner(problem).run(deadline)
         for grasps in batches:
             failed.append(grasps)
