@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from torchgrasp.base import FINGERTIPS, Value
-from torchgrasp.checks import Range, checked
+from torchgrasp.checks import Length, Range, checked
 from torchgrasp.closure import ClosingOptions, SensorModel, choose_options
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, as_plane
@@ -115,12 +115,15 @@ class ContactSpec(Value):
         return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
 
     @checked
-    def relaxed(self, below: float, radius: float) -> "Iterator[ContactSpec]":
-        """Yield specs for an object without contacts: smaller flat areas than `below` [m], then the upper rim.
+    def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
+        """Yield specs for an object without grasps: flat areas smaller than `below` [m], then the object's upper rim.
 
         A fingertip on the table touches the rim of a low object with an inclined normal. The estimated rim is rounder
         than the true one, so its normals are steeper. Therefore the margins of friction and of the fingertips' `radius`
-        [m] are spent step by step.
+        [m] are spent step by step. A given `flat_radius` is kept: then there are no such specs.
+
+        >>> [round(spec.planned_friction, 1) for spec in ContactSpec(table=0.0).relaxed(0.003, 0.0096)]
+        [0.4, 0.6, 0.8]
         """
         if self.flatness is None or self.flat_radius is not None:
             return

@@ -5,12 +5,15 @@ from itertools import pairwise
 
 import pytest
 import torch
+import trimesh
 
 from tests.make import load_hand, real, same_bits
 from torchgrasp import ContactSpec, Status, load_object, plan_grasps, stream_grasps
 from torchgrasp.base import join
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rigid
+from torchgrasp.plan.certify import certify
 from torchgrasp.planner.batches import FIRST, schedule
 from torchgrasp.planner.contacts import LIKELY, Pool, SeededContacts
 from torchgrasp.values import Certificate, Contacts, IKSeeds
@@ -103,6 +106,33 @@ def test_without_a_grasp_contacts_are_planned_on_smaller_flat_areas():
     given = dataclasses.replace(SPEC, flat_radius=0.006)
     assert same_bits(found, plan_grasps(VIEW, HAND, given, reachable=none_on_the_widest, **options))
     assert len(plans) == 3 and bool((found.status == Status.OK).any())
+
+
+def test_a_low_plate_is_grasped_on_its_rim():
+    plate = trimesh.creation.box((0.04, 0.08, 0.012))
+    plate.apply_translation([0.0, 0.0, 0.006])
+    view, hand, plans = partial_view(plate, look_at(60.0, 35.0, target=plate), seed=1), load_hand("allegro"), []
+    note = lambda stage, text, value: plans.extend([value] * (stage == "plan"))  # noqa: E731
+    found = plan_grasps(view, hand, SPEC, 50, observer=note)
+    good = found[found.status == Status.OK]
+    assert len(good) and not bool((plans[0].status == Status.OK).any())
+    assert float(good.meta["planned_friction"]) == pytest.approx(0.4)  # the margin is spent on lower plates alone
+    slope = good.contacts.normals[..., 2]
+    assert bool(((good.contacts.points[..., 2] + 0.012 * slope) > 0.0119).all()) and float(slope.amax(1).min()) > 0.0
+    assert bool(certify(good.contacts, dataclasses.replace(SPEC, friction_margin=1.0)).closed.all())
+    strict = dataclasses.replace(SPEC, flat_radius=0.003)
+    assert not bool((plan_grasps(view, hand, strict, 50).status == Status.OK).any())
+
+
+def test_relaxed_constraints_spend_margins_on_the_rim_alone():
+    flat = [spec for spec in ContactSpec().relaxed(0.006, 0.012)]
+    assert [spec.flat_radius for spec in flat] == [0.004, 0.003] and not any(spec.tip_radius for spec in flat)
+    rims = list(SPEC.relaxed(0.003, 0.0096))
+    assert [spec.friction_margin for spec in rims] == [0.5, 0.75, 1.0] and len({spec.flat_radius for spec in rims}) == 1
+    assert [spec.tip_radius for spec in rims] == pytest.approx([0.012, 0.0108, 0.0096])
+    assert {spec.tip_radius for spec in dataclasses.replace(SPEC, tip_radius=0.02).relaxed(0.003, 0.0096)} == {0.02}
+    for fixed in (dataclasses.replace(SPEC, flat_radius=0.004), ContactSpec.paper(table=0.0)):
+        assert not list(fixed.relaxed(0.008, 0.012))
 
 
 def test_batches_plan_all_starts_and_try_all_rows():

@@ -135,7 +135,7 @@ def test_the_change_that_prevents_most_comes_first(plan, grasps, first):
 
 
 def test_a_disc_too_low_needs_its_table_gone_and_an_object_under_another_the_other_taken_first(first_only):
-    disc, heard = view_of(trimesh.creation.cylinder(radius=0.03, height=0.01)), []
+    disc, heard = view_of(trimesh.creation.cylinder(radius=0.03, height=0.005)), []
     note = lambda *stage: heard.append(stage)  # noqa: E731
     explanation = explain_empty(disc, load_hand("allegro"), TABLE, starts=8, observer=note)
     assert heard == [("change", str(explanation.best), explanation.best)]

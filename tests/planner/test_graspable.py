@@ -1,13 +1,14 @@
 """What the picture of a scene and the hand say against an object, before it is planned."""
 
 import dataclasses
+import itertools
 
 import pytest
 import torch
 import trimesh
 
 from tests.make import half_ball, load_hand, see
-from torchgrasp import Scene, Status, plan_scene
+from torchgrasp import ContactSpec, Scene, Status, plan_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.planner import ThingPlan
@@ -51,7 +52,7 @@ SCENES = {
     Status.OFF_TABLE: beside_table,
     Status.CUT_OFF: lambda: see((-0.123, 0.338, 0.06, 0.1), BOX),
     Status.NO_DEPTH: glass,
-    Status.TOO_LOW: lambda: see((0.0, 0.0, 0.1, 0.008)),
+    Status.TOO_LOW: lambda: see((0.0, 0.0, 0.1, 0.0035)),
     Status.TOO_WIDE: lambda: see((0.0, 0.0, 0.32, 0.1)),
 }
 
@@ -59,6 +60,16 @@ SCENES = {
 @pytest.mark.parametrize("status", SCENES)
 def test_an_object_is_judged_by_its_picture(status):
     assert judge_things(SCENES[status](), HAND)[1] is status
+
+
+def test_a_lower_object_than_the_least_height_offers_no_rim_on_which_a_tip_sticks():
+    slope, rim = torch.linspace(0.0, 1.0, 10_001, dtype=torch.float64), 0.003
+    for friction, radius in itertools.product((0.0, 0.3, 0.8), (0.008, 0.012, 0.02)):
+        spec = ContactSpec(friction=friction, edges=1024, tip_radius=radius)
+        sticks = slope <= friction * (1 - slope**2).sqrt()
+        lowest = (radius - radius * slope + rim - rim * slope)[sticks].min()  # the tip's centre is a radius high
+        assert spec.least_height == pytest.approx(float(lowest), abs=1e-5)
+        assert dataclasses.replace(spec, flat_radius=rim).least_height == pytest.approx(radius + rim)
 
 
 def test_only_objects_beside_the_table_are_refused_cut_off_feet_and_distance_refuse_nothing():
@@ -80,7 +91,7 @@ def test_a_hand_spans_what_its_pads_enclose_and_a_shape_that_may_be_anything_is_
 
 
 def test_refused_objects_are_not_planned(monkeypatch):
-    scene, planned = see((0.2, 0.0, 0.1, 0.008), BOX, (-0.15, 0.1, 0.1, 0.009)), []
+    scene, planned = see((0.2, 0.0, 0.1, 0.004), BOX, (-0.15, 0.1, 0.1, 0.0035)), []
 
     def plan(scene, plan):
         planned.append(scene.target)

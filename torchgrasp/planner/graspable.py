@@ -59,8 +59,8 @@ def _judge(scene: Scene, points: Float[Tensor, "n 3"], label: int, spec: Contact
         return Status.CUT_OFF
     if bounded and _is_see_through(pixels, scene.image.depth):
         return Status.NO_DEPTH
-    top = float(points[:, 2].quantile(0.98))
-    if scene.table is not None and top < spec.least_height:
+    top, higher = points[:, 2].quantile(torch.tensor([0.98, 0.9]).to(points)).tolist()
+    if scene.table is not None and higher < spec.least_height:
         return Status.TOO_LOW
     above = points[points[:, 2] > top - 2 * spec.fingertip_radius, :2]
     return Status.TOO_WIDE if _thickness(above, spec.fingertip_radius / 2) > span else Status.OK
