@@ -96,8 +96,8 @@ class ContactSpec(Value):
     def least_height(self) -> float:
         """The least height [m] of an object that fingertips on the table can touch: on its wall, or on its upper rim.
 
-        A rim of radius q touches a fingertip of radius r at a height h with the normal's slope s, h = (r + q)(1 - s). No
-        wall but a rim counts if `flat_radius` is not given; then q is the least of `FLAT_RADII`.
+        A rim of radius q and a fingertip of radius r touch with a normal of slope s if h = (r + q)(1 - s). Rims count
+        unless `flat_radius` is given; q is the least of `FLAT_RADII`.
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius
