@@ -89,8 +89,8 @@ def test_verdicts(run):
     unplanned = dataclasses.replace(none, grasps=run.grasps[:0])
     assert f"2 of 2 starts: {Status.NOT_CLOSED.sentence}" in refusal(unplanned)
     top = float(run.surface.vertices[:, 2].max())
-    flat, high = (dataclasses.replace(unplanned, spec=ContactSpec(table=top - h)) for h in (0.0101, 0.016))
-    assert refusal(flat).endswith("it is 10 mm high, and this hand needs 15 mm.") and "high" not in refusal(high)
+    flat, high = (dataclasses.replace(unplanned, spec=ContactSpec(table=top - h)) for h in (0.0051, 0.0066))
+    assert refusal(flat).endswith("it is 5 mm high, and this hand needs 6 mm.") and "high" not in refusal(high)
     assert Status.OUT_OF_REACH.sentence in refusal(dataclasses.replace(unplanned, plan=None))
     _, words = read(format_page(none, {}))
     assert "Best grasps" not in words
