@@ -90,12 +90,9 @@ class FrictionEstimate:
     def __init__(self) -> None:
         self.mean, self.std = 0.8, PRIOR_STD
 
-    def update(self, ratio: float, force: float, lagging: bool = False) -> None:
-        """Update the estimate by a sliding fingertip's ratio of tangential to normal force, and its normal force [N].
-
-        The ratio is less certain while it is `lagging`, because the fingertip has just begun to slide.
-        """
-        noise = (1 + lagging) * 0.4 * math.hypot(1.0, ratio) / force
+    def update(self, ratio: float, force: float) -> None:
+        """Update the estimate by a sliding fingertip's tangential over normal force, and its normal force [N]."""
+        noise = 0.4 * math.hypot(1.0, ratio) / force
         weight = self.std**2 / (self.std**2 + noise**2)
         self.mean = min(max(self.mean + weight * (ratio - self.mean), 0.15), 1.5)
         self.std = max(self.std * math.sqrt(1 - weight), MIN_STD)
@@ -133,7 +130,7 @@ class GripHold:
         self.sent, self.trim, self.most = *np.zeros((2, len(push), 3)), 0.0
         self.time = self.steady = self.over = 0.0
         self.released = False
-        self.status, self.slid, self.creep = Status.OK, *np.zeros((2, len(push)))
+        self.status, self.slid = Status.OK, np.zeros(len(push))
 
     @property
     def weight(self) -> float:
@@ -188,21 +185,19 @@ class GripHold:
     def _adapt(self, observation: Observation, period: float) -> None:
         """Update the friction estimate by sliding fingers, and reduce forces that are not needed."""
         speed, sliding = observation.tactile.sliding.numpy(), 0.008  # [m/s]
-        self.creep = self.creep + low_pass(1.0, period) * (speed.clip(max=sliding) - self.creep)
         slides = (speed > sliding) & observation.tactile.contact.numpy()
         self.slid = np.where(slides, self.slid + period, 0.0)
         if self.time < RAMP:
             return
-        push = -(self.felt * self.normals).sum(-1)
-        ratios, pressing = friction_ratios(self.felt, self.normals), push > 0.5 * MIN_PUSH
-        for i in np.flatnonzero(slides & pressing):
-            self.friction.update(float(min(ratios[i], 2.0)), float(push[i]), bool(self.slid[i] <= FORCE_LAG))
-        self._release(bool((slides | (self.creep > 0.002) | ~pressing).any()), period)  # [m/s]
+        push, ratios = -(self.felt * self.normals).sum(-1), friction_ratios(self.felt, self.normals)
+        for i in np.flatnonzero((self.slid > FORCE_LAG) & (push > 0.5 * MIN_PUSH)):
+            self.friction.update(float(min(ratios[i], 2.0)), float(push[i]))
+        self._release(period)
 
-    def _release(self, moving: bool, period: float) -> None:
+    def _release(self, period: float) -> None:
         """Once the lifted load is steady, reduce the forces of the closing and the reserve for an unknown weight."""
-        if moving or self.weight > 1.05 * self.most:
-            self.most, self.steady = max(self.most, self.weight), 0.0
+        if self.weight > 1.05 * self.most:
+            self.most, self.steady = self.weight, 0.0
         self.steady += period
         if self.steady < 0.3 or self.weight < LIFTED:
             return
