@@ -34,12 +34,14 @@ def reference(coupling: torch.Tensor | None = None) -> ClosingReference:
     h = coupling.shape[1]
     ones, zero, names = torch.ones(h).double(), torch.zeros(h).double(), tuple(f"slide_{k}" for k in range(9))
     hand = load_hand("barrett")
+    spheres = hand.collision_spheres
     hand = dataclasses.replace(
         hand,
         actuators=dict.fromkeys(names, next(iter(hand.actuators.values()))),
         actuated=ActuatedJoints(names[:h], -ones, ones, coupling, torch.zeros(9).double()),
         tree=dataclasses.replace(hand.tree, joint_names=names),
         tips=dataclasses.replace(hand.tips, radius=real([0.01, 0.01, 0.01])),
+        collision_spheres=dataclasses.replace(spheres, center=spheres.center + 10.0),  # far away
     )
     return ClosingReference(
         hand=hand,

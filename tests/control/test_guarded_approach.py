@@ -9,6 +9,7 @@ from tests.control.test_localization import CENTER, RADIUS, ball_field
 from tests.point_fingers import PERIOD, observation, on_table, real
 from torchgrasp import ClosingReference, GraspController, load_hand
 from torchgrasp.closure import ClosingOptions, SensorModel
+from torchgrasp.control import no_contact, observe
 from torchgrasp.control.object_pose import FINE_TURNS, TURNS
 from torchgrasp.control.recovery import ACCELERATION, CAREFUL_SPEED, SPEED, GuardedApproach
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
@@ -103,6 +104,27 @@ def test_guarded_approach_arrives_though_every_finger_touches_all_the_way(placed
     assert hand.stops == ALL.stops if placed else not hand.palm.any()
 
 
+def test_guarded_approach_feels_a_link_by_the_drives_of_its_joints():
+    hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
+    plan = dataclasses.replace(ClosingReference.from_grasp(hand, grasp), table=above().table, surface=ball_field())
+    coming, joints = GuardedApproach(plan, ALL, LENGTH), plan.pregrasp
+    still = observe(hand, joints, no_contact())
+    for _ in range(30):
+        coming(still, PERIOD)
+    assert 0.0 < coming.left < LENGTH - 0.02 and coming.stops == 0 and not coming.feeling
+    joint = hand.tree.joint_names.index(hand.joint_names[5])
+    for torque, stops in ((0.02, False), (0.04, True)):
+        pushed = still.joints.clone()
+        pushed[joint] += torque / float(plan.kp[joint])
+        coming(dataclasses.replace(still, joints=pushed), PERIOD)
+        assert coming.feeling is stops
+    spheres = hand.collision_spheres
+    moved = hand.tree.moves[spheres.link_index, joint] > 0
+    assert 0 < len(coming.touches.links) == int(moved.sum()) < len(moved)
+    there = hand.sphere_centres(plan.pick(pushed))[moved] - coming.left * plan.approach
+    assert torch.allclose(coming.touches.links[:, :3], there, rtol=0, atol=1e-9)
+
+
 def approach(controller, shift):
     """Step a controller until its hand has arrived; return what it commanded."""
     commanded = [controller.targets]
@@ -146,6 +168,22 @@ def test_controller_refuses_a_bad_length_of_approach():
     for length in ("0.1", float("nan"), -0.1, 1.1, None):
         with pytest.raises(BadArgument, match="approach"):
             GraspController(above(), approach=length)
+
+
+def test_controller_comes_down_once_more_after_it_closed_on_nothing():
+    controller, lefts, palms = GraspController(above(), approach=LENGTH), [], []
+    nothing = observation(0.02)
+    while not controller.closed:
+        targets = controller.step(nothing, PERIOD)
+        lefts.append(targets.left)
+        palms.append(targets.palm)
+    assert controller.attempts == ALL.attempts == 3
+    left, palm = real(lefts), torch.stack(palms)
+    ups = ((left[1:] > 0) & (left[:-1] == 0)).nonzero()[:, 0]
+    assert len(ups) == ALL.attempts - 1  # it draws back before its palm moves to another place
+    assert (left.diff().abs() <= SPEED * PERIOD * (1 + 1e-9)).all()
+    places = [palm[int(k)] for k in (*ups, -1)]
+    assert all((one - other).norm() > 0.015 for k, one in enumerate(places) for other in places[:k])
 
 
 def test_reference_has_the_approach_in_the_hands_axes():

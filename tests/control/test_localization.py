@@ -15,7 +15,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 
 CENTER, RADIUS = TARGET.mean(0), 0.03
-HALF = real([0.03, 0.02, 0.045])
+HALF, STILL = real([0.03, 0.02, 0.045]), torch.zeros(3).double()
 
 
 def ball(points):
@@ -53,21 +53,22 @@ def displaced(shift, turn=0.0):
     return lambda x: (x - CENTER) @ rotation.T + CENTER + shift, lambda n: n @ rotation.T
 
 
+def touching(points, normals, contact):
+    """An observation of fingertips that touch."""
+    seen, contact = observation(contact=torch.tensor(contact)), torch.tensor(contact)[:, None]
+    points, normals = torch.where(contact, points, torch.nan), torch.where(contact, normals, torch.nan)
+    return dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, points=points, normals=normals))
+
+
 def touch(reference, points, normals, contact=(True, True, True), tips=None) -> Touches:
-    touches, contact = Touches(reference), torch.tensor(contact)
-    seen = observation(contact=contact)
-    tactile = dataclasses.replace(
-        seen.tactile,
-        points=torch.where(contact[:, None], points, torch.nan),
-        normals=torch.where(contact[:, None], normals, torch.nan),
-    )
+    touches, seen = Touches(reference), touching(points, normals, contact)
     tips = points + reference.hand.tips.radius[:, None] * normals if tips is None else tips
-    touches.add(dataclasses.replace(seen, tips=tips, tactile=tactile), torch.zeros(3).double())
+    touches.add(dataclasses.replace(seen, tips=tips), torch.zeros(3).double())
     return touches
 
 
-def locate(reference, touches):
-    search = Localization(reference)
+def locate(reference, touches, expected=STILL, visited=()):
+    search = Localization(reference, expected, visited)
     while not search.done:
         search(touches)
     return search.displacement
@@ -76,12 +77,49 @@ def locate(reference, touches):
 BALL_POINTS = unit(real([[1, 0.3, 0.5], [0.8, -0.2, -1], [-1, 0.1, 0.2]]))
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.015, 0.0), (-0.012, 0.02), (0.021, -0.027)])
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.015, 0.0), (-0.012, 0.02), (0.021, -0.027), (-0.05, 0.04)])
 def test_localization_finds_a_ball_from_three_touches(shift):
     wanted = real([shift[0], 0.0, shift[1]])
     there = known(ball_field())
     found = locate(there, touch(there, CENTER + RADIUS * BALL_POINTS + wanted, BALL_POINTS))
     assert (found[:3] - wanted).norm() < PITCH / 2
+
+
+def test_localization_finds_the_link_that_touches_and_the_nearest_place_to_where_the_object_is_expected():
+    # the nearer of two spheres of 10 mm touches a ball of 30 mm: the centres are 40 mm apart, on the line between them
+    there, gap = known(ball_field()), RADIUS + 0.01
+    links = torch.cat([CENTER + real([[0.09, 0, 0], [0.3, 0, 0.3]]), real([[0.01], [0.01]])], -1)
+    far, nothing = CENTER + 0.3 * torch.eye(3).double(), (False, False, False)
+    touches = Touches(there, links)
+    touches.add(dataclasses.replace(observation(contact=torch.tensor(nothing)), tips=far), STILL)
+    for expected in (real([0.0, 0, 0.0]), real([0.02, 0, 0.04]), real([0.03, 0, -0.03])):
+        towards = unit(expected - real([0.09, 0, 0]))
+        wanted = real([0.09, 0, 0]) + gap * towards
+        share = 0.03**2 / (0.03**2 + 0.004**2)  # of Gaussians: the prior draws a little
+        wanted = expected + share * (wanted - expected)
+        found = locate(there, touches, expected)
+        assert (found[:3] - wanted).norm() < 3e-3
+
+
+def test_localization_without_a_touch_keeps_away_from_visited_places_and_near_where_the_object_is_expected():
+    there, far = known(ball_field()), CENTER + 0.3 * torch.eye(3).double()
+    nothing, visited = touch(there, far, BALL_POINTS, (False, False, False), far), []
+    for _ in range(4):
+        visited.append(locate(there, nothing, visited=visited)[:3])
+    gaps = torch.stack(visited)[:, None] - torch.stack(visited)
+    assert visited[0].norm() == 0.0 and all(0.02 < x.norm() < 0.06 for x in visited[1:])
+    assert (gaps.norm(dim=-1) + torch.eye(4)).min() > 0.02
+
+
+def test_touches_with_links_keep_what_a_fingertip_felt_before_it_lost_the_object():
+    there = known(ball_field())
+    points, gone = CENTER + RADIUS * BALL_POINTS, observation(contact=torch.zeros(3, dtype=torch.bool))
+    for links, felt in ((None, False), (torch.zeros(0, 4), True)):
+        touches = Touches(there, links)
+        for seen in (*[touching(points, BALL_POINTS, (True, False, True))] * 2, gone):
+            touches.add(seen, torch.zeros(3).double())
+        assert touches.felt.tolist() == [felt, False, felt]
+        assert torch.allclose(touches.means()[0][0], points[0], rtol=0, atol=1e-12)
 
 
 def test_localization_by_one_touch_uses_its_normal():
@@ -92,7 +130,7 @@ def test_localization_by_one_touch_uses_its_normal():
     touches = touch(there, CENTER + RADIUS * normal + wanted, normal, (True, False, False), tips)
     along = torch.linalg.cross(normal[0], real([0, 1, 0]))
     known_by = {0: 0.004, 1: 0.3 * RADIUS}  # across the surface, and along it
-    shares = [0.02**2 / (0.02**2 + known_by[k] ** 2) for k in (0, 1)]  # of Gaussians
+    shares = [0.03**2 / (0.03**2 + known_by[k] ** 2) for k in (0, 1)]  # of Gaussians
     found = locate(there, touches)[:3]
     for axis, share in zip((normal[0], along), shares, strict=True):
         assert abs(float(found @ axis) - share * float(wanted @ axis)) < 2e-3
@@ -150,7 +188,7 @@ def test_localization_ignores_dead_fingers():
 def test_localization_tries_one_turn_a_call_and_finds_no_displacement_without_touches():
     there, far = known(ball_field()), CENTER + 0.2 * torch.eye(3).double()
     assert locate(there, touch(there, far, BALL_POINTS, (False, False, False), far)).norm() == 0.0
-    search, touches = Localization(there), touch(there, CENTER + RADIUS * BALL_POINTS, BALL_POINTS)
+    search, touches = Localization(there, STILL), touch(there, CENTER + RADIUS * BALL_POINTS, BALL_POINTS)
     for k in range(len(TURNS) + len(FINE_TURNS)):
         assert not search.done and search.step == k
         search(touches)

@@ -104,7 +104,9 @@ def test_controller_closes_again_after_meeting_nothing(closing):
     controller = GraspController(on_table(), closing)
     ticks = close(controller, observation(0.02))
     assert controller.attempts == ClosingOptions().attempts
-    assert ticks * PERIOD < 2 * (CLOSING_TIME + PRESSING_TIME) + OPENING_TIME + 0.02 / PALM_SPEED + 0.3
+    assert ticks * PERIOD < controller.attempts * (
+        CLOSING_TIME + PRESSING_TIME + OPENING_TIME + 0.02 / PALM_SPEED + 0.3
+    )
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_a_hand_that_closed_beside_the_object_closes_once_more(seen, aside):
         for options in (ClosingOptions(attempts=1), None)
     )
     assert (once.attempts, once.held) == (1, False)
-    assert (again.attempts, again.held) == (2, True)
+    assert again.attempts > 1 and again.held
 
 
 @pytest.mark.parametrize("aside", [(0.0, 0.03), (0.0, -0.04)])

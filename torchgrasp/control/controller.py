@@ -13,6 +13,7 @@ from torchgrasp.base import check_device, settle
 from torchgrasp.checks import Range, checked
 from torchgrasp.closure import ClosingOptions, choose_options
 from torchgrasp.control.holding import ForceHold, GripHold, PositionHold
+from torchgrasp.control.object_pose import Touches
 from torchgrasp.control.paper.closings import Impedance, OpenLoopClosing, PaperClosing, PositionClosing
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.control.recovery import PRESSING_TIME, GraspCheck, GuardedApproach, Reopening, can_guard
@@ -90,8 +91,10 @@ class GraspController:
 
     def _prepare(self, reference: ClosingReference, approach: float) -> None:
         """Begin with a plan: first its approach, if there is one, and then its closing."""
-        self.reference, self.attempts, self.stops = reference, 0, 0
+        self.reference, self.attempts, self.stops, self.length = reference, 0, 0, approach
         self.guard = GuardedApproach(reference, self.options, approach) if approach else None
+        self.felt = Touches(reference) if approach else None  # at the last stop
+        self.visited: list[Float[Tensor, 3]] = []  # the palm's displacements [m] in earlier attempts
         self._make_closing = functools.partial(make_closing, reference, self.mode, self.options)
         self._begin(self._make_closing())
         self.targets = Targets(reference.expand(reference.pregrasp), self.path, approach)
@@ -181,8 +184,9 @@ class GraspController:
         """Return the targets during the approach; at its end, give the closing the object pose found by touch."""
         guard(observation, period)
         if guard.done:
-            self.guard, self.stops = None, guard.stops
-            if self.stops and isinstance(self.closing, UncertaintyClosing):
+            self.guard, self.stops = None, self.stops + guard.stops
+            self.felt = guard.touches if guard.stops else self.felt
+            if guard.careful and isinstance(self.closing, UncertaintyClosing):
                 self.closing.begin_at(guard.displacement, guard.palm)
         return Targets(self.targets.joints, self.path + guard.palm, guard.left)
 
@@ -202,8 +206,10 @@ class GraspController:
             self.hold = self._make_hold(self.reference, observation, self.targets.joints)
         if self.options.attempts > 1 and self.reference.table is not None:
             assert isinstance(self.closing, UncertaintyClosing)
+            self.visited = [*self.visited, self.closing.palm]
             last = self.attempts >= self.options.attempts
-            self.check = GraspCheck(self.reference, self.closing.displacement, self.closing.palm, last)
+            known = self.closing.displacement, self.closing.palm, last, self.felt, self.visited
+            self.check = GraspCheck(self.reference, *known)
         return self.targets.joints
 
     def _judge(self, observation: Observation) -> None:
@@ -212,17 +218,19 @@ class GraspController:
             return
         self.check(observation, self.pressed)
         if self.check.judged and not self.check.secure:
-            reach, joints = self.options.palm_reach, self.targets.joints
+            reach, joints = 0.0 if self.length else self.options.palm_reach, self.targets.joints
             self.reopening = Reopening(self.reference, self.check.displacement, joints, self.closing.palm, reach)
             self.hold, self.check, self.pressed = None, None, 0.0
 
     def _reopen(self, reopening: Reopening, period: float) -> Targets:
-        """Return the targets of the opening hand; once it is open, start the next closing."""
+        """Return the targets of the opening hand; once it is open, start the next approach or the next closing."""
         targets = Targets(reopening(period), self.path + reopening.palm)
         if reopening.done:
             closing = self._make_closing()
             assert isinstance(closing, UncertaintyClosing)
             self._begin(closing.begin_at(reopening.displacement, reopening.palm))
+            if self.length:
+                self.guard = GuardedApproach(self.reference, self.options, self.length, reopening)
         return targets
 
 

@@ -5,6 +5,8 @@ While the fingers close, `ContactPlanes` uses the tangent plane at each planned 
 the object's own surface.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -17,7 +19,7 @@ from torchgrasp.geometry.linalg import across, unit
 TURNS, FINE_TURNS = (-0.24, -0.12, 0.0, 0.12, 0.24), (-0.06, 0.0, 0.06)
 """Turns [rad] of the object that `Localization` tries, and turns about the best of them."""
 
-PITCH = 0.004  # distance [m] between the displacements that `Localization` tries
+PITCH, FARTHEST = 0.006, 0.072  # distance [m] between the displacements that `Localization` tries, and the largest
 
 
 class ContactPlanes:
@@ -79,10 +81,12 @@ def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
 class Touches:
     """Time averages of the contact points and normals that a resting hand senses, in the frame of the planned hand.
 
-    `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have reported where.
+    `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have reported where. With
+    `links`, fingertips that no longer touch count, too; if `links` holds spheres (centres and radii [m]), one touches.
     """
 
-    def __init__(self, reference: ClosingReference) -> None:
+    def __init__(self, reference: ClosingReference, links: Float[Tensor, "m 4"] | None = None) -> None:
+        self.links, self.kept = torch.zeros(0, 4) if links is None else links, links is not None
         self.points, self.normals = torch.zeros(2, *reference.normals.shape, dtype=torch.float64)
         self.count = torch.zeros(len(reference.normals), dtype=torch.int64)
         self.tips, self.known = reference.gains.target, reference.alive
@@ -99,8 +103,8 @@ class Touches:
 
     @property
     def felt(self) -> Bool[Tensor, "f"]:
-        """A mask of the fingertips that still touch the object and have reported where they touch."""
-        return self.contact & (self.count > 0)
+        """A mask of the fingertips that touch the object and have reported where they touch."""
+        return (self.contact | torch.full_like(self.contact, self.kept)) & (self.count > 0)
 
     def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
         """Return each fingertip's mean contact point [m] and unit normal; zero for fingertips without contact."""
@@ -110,15 +114,19 @@ class Touches:
 class Localization:
     """Search for the object displacement that best explains the touches; each call tries one rotation angle.
 
-    `displacement` holds the translation of the contacts' centroid [m] and the rotation about it [rad].
+    Before any touch, the object is probably displaced by `expected` [m], and not by one of the `visited` displacements
+    [m]. `displacement` holds the translation of the contacts' centroid [m] and the rotation about it [rad].
     """
 
-    def __init__(self, reference: ClosingReference) -> None:
+    def __init__(
+        self, reference: ClosingReference, expected: Float[Tensor, "3"], visited: Sequence[Float[Tensor, "3"]] = ()
+    ) -> None:
         assert reference.surface is not None and reference.table is not None
         self.surface, self.obj_from_hand = reference.surface, reference.obj_from_hand.double()
         self.center, self.radius = reference.gains.target.mean(0), reference.hand.tips.radius.double()
         self.up = unit(reference.table.normal.double())
         self.axes = torch.stack(across(self.up))
+        self.expected, self.visited = self.axes @ expected, [self.axes @ place for place in visited]
         self.step, self.cost = 0, torch.inf
         self.shift, self.turn = torch.zeros(2, dtype=torch.float64), 0.0
         self.coarse = self.shift, self.turn
@@ -136,7 +144,7 @@ class Localization:
     def __call__(self, touches: Touches) -> None:
         """Try one rotation angle with a grid of translations; the last calls search finely around the best result."""
         if self.step < len(TURNS):
-            shifts, turn = _square(0.032, PITCH), TURNS[self.step]
+            shifts, turn = _square(FARTHEST, PITCH), TURNS[self.step]
         else:
             if self.step == len(TURNS):
                 self.coarse = self.shift, self.turn
@@ -151,7 +159,7 @@ class Localization:
 
     def _costs(self, touches: Touches, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
         """Return the negative log-probability of each translation [m] along the table, for one rotation [rad]."""
-        surface_std, normal_std, shift_std, turn_std = 0.004, 0.3, 0.02, 0.15  # [m, 1, m, rad]
+        surface_std, normal_std, shift_std, turn_std = 0.004, 0.3, 0.03, 0.15  # [m, 1, m, rad]
         gap, worst = 0.001, 20.0  # least distance [m] of a tip in the air; bound on the cost of one tip
         felt, (points, normals) = touches.felt, touches.means()
         rotation = rotation_from_vector(turn * self.up)
@@ -163,7 +171,13 @@ class Localization:
         facing = ((outward - normals) / normal_std).square().sum(-1)
         inside = ((self.radius + gap - distance).clamp_min(0.0) / surface_std).square().clamp_max(2 * worst)
         fit = torch.where(felt, place + facing, torch.where(touches.contact | ~touches.known, 0.0, inside)).sum(-1)
-        return 0.5 * (fit + (shifts / shift_std).square().sum(-1) + (turn / turn_std) ** 2)
+        if len(touches.links):
+            before = (touches.links[:, :3] - self.center - (shifts @ self.axes)[:, None]) @ rotation + self.center
+            off = self.surface.query(apply(self.obj_from_hand, before))[0] - touches.links[:, 3]
+            fit = fit + (off.abs().amin(-1) / surface_std).square().clamp_max(2 * worst)
+        for place in self.visited:
+            fit = fit + 4 * worst * torch.exp(-2 * ((shifts - place) / shift_std).square().sum(-1))
+        return 0.5 * (fit + ((shifts - self.expected) / shift_std).square().sum(-1) + (turn / turn_std) ** 2)
 
 
 def _square(half: float, pitch: float) -> Float[Tensor, "m 2"]:

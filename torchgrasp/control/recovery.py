@@ -4,6 +4,7 @@ The first two locate the object from touches (`Localization`) and move the palm 
 """
 
 import math
+from collections.abc import Sequence
 from typing import Annotated
 
 import torch
@@ -14,6 +15,7 @@ from torchgrasp.checks import Range, checked
 from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.object_pose import Localization, Touches
 from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.sensing import TORQUE_NOISE
 from torchgrasp.control.tactile import STILL, Observation, low_pass
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import limit_norm, unit
@@ -38,22 +40,29 @@ def can_guard(reference: ClosingReference) -> bool:
 
 
 class GuardedApproach:
-    """Move the opened hand to its pre-grasp, `length` [m] away, and stop it when a fingertip touches (guarded move).
+    """Move the opened hand to its pre-grasp, `length` [m] away, and stop it when a finger touches (guarded move).
 
-    After a stop the hand averages its touch readings, locates the object, retreats, moves its palm sideways and goes
-    on. After the last allowed stop the hand ignores touches.
+    Fingertips sense a touch, and other links are felt by the drives of their joints. After a stop the hand averages its
+    touch readings, locates the object, retreats, moves its palm sideways and goes on. After the last allowed stop the
+    hand ignores touches. A hand that has been reopened (`after`) starts at its pre-grasp, and retreats first.
 
     `left` [m] is the remaining length of the approach, `palm` [m] the palm's displacement from its planned path,
     `stops` the number of stops. `displacement` holds the object's translation [m] and rotation [rad] at the last touch.
     """
 
-    def __init__(self, reference: ClosingReference, options: ClosingOptions, length: float) -> None:
+    def __init__(
+        self, reference: ClosingReference, options: ClosingOptions, length: float, after: "Reopening | None" = None
+    ) -> None:
         assert reference.approach is not None
         self.reference, self.options, self.length, self.direction = reference, options, length, reference.approach
         self.left, self.speed, self.retreat, self.stops = length, 0.0, 0.0, 0
         self.palm, self.goal, self.displacement = STILL, STILL, torch.zeros(6, dtype=torch.float64)
         self.time, self.feeling = 0.0, False
-        self.touches, self.search = Touches(reference), Localization(reference)
+        self.careful, self.rest, self.inertia = after is not None, None, torch.zeros_like(reference.kp)
+        if after is not None:
+            self.left, self.palm = 0.0, after.palm
+            self._turn_to(after.displacement)
+        self.touches, self.search = Touches(reference), Localization(reference, STILL)
 
     @property
     def done(self) -> bool:
@@ -71,54 +80,93 @@ class GuardedApproach:
                 self.speed = self.retreat = 0.0
         elif not torch.equal(self.palm, self.goal):
             self.palm = next_palm(self.palm, self.goal, period)
-        elif self.stops < self.options.stops and bool(observation.tactile.contact.any()):
+        else:
+            self._advance(observation, period)
+
+    def _advance(self, observation: Observation, period: float) -> None:
+        """Move on towards the pre-grasp, or stop at a touch of a fingertip or of another link."""
+        links = self._touching_links(observation)
+        if self.stops < self.options.stops and (bool(observation.tactile.contact.any()) or len(links)):
             self.speed, self.time, self.feeling = 0.0, 0.0, True
-            self.touches, self.search = Touches(self.reference), Localization(self.reference)
+            self.touches, self.search = (
+                Touches(self.reference, links),
+                Localization(self.reference, self.displacement[:3]),
+            )
+            self.touches.add(observation, self.palm - self.left * self.direction)
         else:
             braking = math.sqrt(2 * ACCELERATION * self.left)  # the speed from which the hand just stops in time
-            fastest = CAREFUL_SPEED if self.stops else SPEED
+            fastest = CAREFUL_SPEED if self.careful else SPEED
             self.speed = min(self.speed + ACCELERATION * period, fastest, max(braking, ACCELERATION * period))
             self.left = max(self.left - self.speed * period, 0.0)
+
+    def _touching_links(self, observation: Observation) -> Float[Tensor, "m 4"]:
+        """Return spheres of links of which one touches, as the drives feel: centres and radii [m]; or none."""
+        hand, joints, settled = self.reference.hand, observation.joints, 0.05  # [m/s]: the palm has not just stopped
+        self.rest = joints if self.rest is None else self.rest
+        pushes = (self.reference.kp * (joints - self.rest)).abs()
+        if self.length - self.left < 0.02:  # the hand is far from the object, and speeds up
+            self.inertia = torch.maximum(self.inertia, pushes)
+        excess, spheres = pushes - self.inertia - 3 * TORQUE_NOISE, hand.collision_spheres
+        if self.speed < settled or bool((excess <= 0.0).all()):
+            return torch.zeros(0, 4, dtype=torch.float64)
+        moved = hand.tree.moves[:, excess.argmax()][spheres.link_index] > 0
+        centres = hand.sphere_centres(self.reference.pick(joints))[moved] + self.palm - self.left * self.direction
+        return torch.cat([centres, spheres.radius.double()[moved, None]], -1)
 
     def _feel(self, observation: Observation, period: float) -> None:
         """Average the touch readings, then locate the object, then choose the palm's new goal: one stage per call."""
         if self.time < 0.06:  # [s]
             self.time += period
             self.touches.add(observation, self.palm - self.left * self.direction)
-        elif not self.search.done and bool(self.touches.felt.any()):
+        elif not self.search.done and (bool(self.touches.felt.any()) or len(self.touches.links)):
             self.search(self.touches)
         else:
-            self.feeling, self.stops = False, self.stops + 1
+            self.feeling, self.careful, self.stops = False, True, self.stops + 1
             if self.search.done:
-                self.displacement = self.search.displacement
-                self.goal = palm_goal(self.displacement[:3], self.reference.table, self.options.palm_reach)
-            self.retreat = min(self.left + 0.02, self.length)
+                self._turn_to(self.search.displacement)
+            self.retreat = max(self.retreat, min(self.left + 0.02, self.length))
+
+    def _turn_to(self, displacement: Float[Tensor, "6"]) -> None:
+        """Let the palm follow a displacement of the object, after a retreat as far as the palm then moves."""
+        self.displacement = displacement
+        self.goal = palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
+        self.retreat = min(self.left + float(torch.linalg.vector_norm(self.goal - self.palm)), self.length)
 
 
 class GraspCheck:
     """Judge a pressing grasp: `judged` turns true when the result is known, `secure` says whether to lift.
 
-    `displacement` holds the object's translation [m] and rotation [rad] that the closing estimated; they are estimated
-    anew from the touches if the plan has table and surface. `palm` [m] is the palm's displacement from its plan. In the
-    `last` attempt every grasp counts as secure.
+    `displacement` holds the object's translation [m] and rotation [rad] that the closing estimated. If the plan has
+    table and surface, they are estimated anew from the touches; or if there are none, from those `before` the closing,
+    away from the places `visited` [m]. `palm` [m] is the palm's displacement from its plan. In the `last` attempt every
+    grasp counts as secure.
     """
 
     def __init__(
-        self, reference: ClosingReference, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"], last: bool
+        self,
+        reference: ClosingReference,
+        displacement: Float[Tensor, "6"],
+        palm: Float[Tensor, "3"],
+        last: bool,
+        before: Touches | None = None,
+        visited: Sequence[Float[Tensor, "3"]] = (),
     ) -> None:
-        self.palm, self.displacement = palm, displacement
-        self.touches = Touches(reference)
-        self.search = None if reference.surface is None or reference.table is None else Localization(reference)
+        self.reference, self.palm, self.displacement = reference, palm, displacement
+        self.touches, self.before, self.visited = Touches(reference), before, visited
+        self.known = reference.surface is not None and reference.table is not None
+        self.search: Localization | None = None
         self.judged = self.secure = last
 
     def __call__(self, observation: Observation, pressed: float) -> None:
         """Average the touches, locate the object, and judge the grasp once `pressed` [s] reaches `PRESSING_TIME`."""
         if self.judged or pressed < 0.1:
             return
+        touches, visited = (self.touches, ()) if bool(self.touches.felt.any()) else (self.before, self.visited)
         if pressed < 0.3:
             self.touches.add(observation, self.palm)
-        elif self.search is not None and not self.search.done and bool(self.touches.felt.any()):
-            self.search(self.touches)
+        elif self.known and touches is not None and not (self.search and self.search.done):
+            self.search = self.search or Localization(self.reference, STILL, visited)
+            self.search(touches)
             self.displacement = self.search.displacement
         elif pressed >= PRESSING_TIME - 1e-9:
             self.touches.contact = observation.tactile.contact

@@ -118,7 +118,7 @@ PROTOCOLS = {
         Protocol("household", TrialSpec(shake=0.003, force=6.0)),
         Protocol(
             "table-lift",
-            TrialSpec("uncertainty", "grip", mass=0.249, table_friction=0.2, lift_height=0.2),
+            TrialSpec("uncertainty", "grip", mass=0.249, table_friction=0.2, lift_height=0.2, approach=0.16),
             criterion="risen",
             tries=3,
         ),

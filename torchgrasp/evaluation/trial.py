@@ -177,8 +177,7 @@ class TrialRun:
         scene_spec = driver.scene_spec if trial.truth.camera is None else self._relook(driver, trial.truth.camera)
         self.scene = open_scene(scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
-        palm = self.controller.targets.palm
-        self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator, palm)
+        self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
         self.overlap, self.slid = self.scene.penetration(), np.zeros(3)
 
     def _relook(self, driver: TrialDriver, camera: Float[Tensor, "4 4"]) -> SceneSpec:
@@ -235,7 +234,7 @@ class TrialRun:
         """Run the controller and the simulation for one control tick."""
         left = self.controller.targets.left
         targets = self.controller.step(self.observation, self.robot.period)
-        if left > 0.0:
+        if self.spec.approach:
             self.scene.approach(targets.left, (left - targets.left) / self.robot.period)
         self.observation = self.robot.tick(targets)
 

@@ -8,7 +8,6 @@ import torch
 
 from torchgrasp.checks import Range, checked
 from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
-from torchgrasp.control.tactile import STILL
 from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene import Scene, StepContacts
 from torchgrasp.sim.scene_spec import SceneSpec
@@ -55,16 +54,10 @@ class SimulatedHand:
         reference: the closing plan.
         control_rate: rate of control ticks [Hz].
         generator: draws the noise of the fingertips; without one there is no noise.
-        palm: displacement of the palm [m] at which the scene begins.
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        reference: ClosingReference,
-        control_rate: float,
-        generator: torch.Generator | None,
-        palm: torch.Tensor = STILL,
+        self, scene: Scene, reference: ClosingReference, control_rate: float, generator: torch.Generator | None
     ) -> None:
         self.scene, self.reference = scene, reference
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
@@ -72,7 +65,8 @@ class SimulatedHand:
         fingers = len(reference.hand.tips)
         self.steps, self.first_touch = 0, [float("inf")] * fingers
         self.first_stray, self.stray, self.most_stray = np.full(3, np.inf), np.zeros(3), np.zeros(3)
-        self._palm, self.pushes = palm.numpy(), np.zeros((fingers, 3))
+        self._palm: np.ndarray | None = None
+        self.pushes = np.zeros((fingers, 3))
         self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
         self.sensor = FingertipSensor(reference, generator)
         nothing = torch.full((fingers, 3), torch.nan, dtype=torch.float64)
@@ -91,10 +85,11 @@ class SimulatedHand:
             raise BadArgument("targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF")
         self.scene.drive(targets.joints.numpy()[self._to_scene])
         palm = targets.palm.numpy()
-        if palm.any() or self._palm.any():
+        last = palm if self._palm is None else self._palm  # the scene begins where the palm is first sent
+        if palm.any() or last.any():
             rotation = self.scene.hand_pose()[:3, :3]
-            self.scene.shift(rotation @ palm, rotation @ (palm - self._palm) / self.period)
-            self._palm = palm
+            self.scene.shift(rotation @ palm, rotation @ (palm - last) / self.period)
+        self._palm = palm
         contacts, before = StepContacts.none(len(self.force)), self.stray.copy()
         for _ in range(self.substeps):
             step = self.scene.step()
