@@ -59,25 +59,25 @@ def schedule(starts: int, most: int) -> list[Batch]:
 
 
 def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
-    """Yield the grasps of each batch, as `Planner.run`; if none is executable, plan with relaxed constraints.
+    """Yield the grasps of each batch, as `Planner.run`; if none is likely to hold, plan with relaxed constraints, too.
 
     A contact set must be flat within the largest of `FLAT_RADII` that the object allows, which can leave few contacts.
     The failed grasps are those of the last constraints (`ContactSpec.relaxed`).
     """
-    failed, given = list[Grasps](), problem.given_spec
+    failed, given, best = list[Grasps](), problem.given_spec, 0.0
     relaxed = given.relaxed(problem.spec.ring_radius, float(problem.hand.tips.radius.max()))
     for spec in (given, *relaxed):
         failed.clear()
         if spec is not given:
             problem = dataclasses.replace(problem, given_spec=spec)
-        batches = Planner(problem).run(deadline)
-        for grasps in batches:
+        for grasps in Planner(problem).run(deadline):
+            good = grasps[executable(grasps)]
             failed.append(grasps)
-            if bool(executable(grasps).any()):
+            if len(good):
+                best = max(best, float(torch.sigmoid(good.score).max()))
                 yield from failed
-                yield from batches
-                return
-        if problem.buried or time.monotonic() >= deadline:
+                failed.clear()
+        if best > 0.5 or problem.buried or time.monotonic() >= deadline:
             break
     yield from failed
 
