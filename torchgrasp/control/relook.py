@@ -30,7 +30,7 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
         table: the table in this frame.
 
     >>> ball = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3).norm(dim=1).reshape(41, 41, 41) - 0.05
-    >>> directions = torch.nn.functional.normalize(torch.cartesian_prod(*[torch.linspace(-1, 1, 6)] * 3))
+    >>> directions = unit(torch.cartesian_prod(*[torch.linspace(-1, 1, 6)] * 3))
     >>> seen = torch.tensor([0.04, -0.02, 0.0]) + 0.05 * directions
     >>> surface = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball)
     >>> relocate(surface, PointCloud(seen), Plane.horizontal(-0.05))[:3, 3].round(decimals=2) + 0.0
