@@ -18,8 +18,6 @@ TIP_RADIUS, SEPARATION = 0.012, 0.026
 """Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind smaller fingertips."""
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
 """Radii [m] within which the surface at a contact must be flat; the largest that the object allows is used."""
-RIM = 0.001
-"""Such a radius [m] on the upper rim of an object too low for contacts on its walls."""
 
 
 @checked
@@ -128,11 +126,11 @@ class ContactSpec(Value):
         if self.flatness is None or self.flat_radius is not None:
             return
         yield from (dataclasses.replace(self, flat_radius=flat) for flat in FLAT_RADII if flat < below)
-        widest = self.for_fingertips(radius).fingertip_radius
+        rim, widest = 0.001, self.for_fingertips(radius).fingertip_radius  # radius [m] that is flat on a rim
         for spent in (0.0, 0.5, 1.0) if self.table is not None else ():
             tips = widest + spent * (radius - widest) if self.tip_radius is None and radius > 0 else self.tip_radius
             margin = self.friction_margin + spent * (1 - self.friction_margin)
-            yield dataclasses.replace(self, flat_radius=RIM, tip_radius=tips, friction_margin=margin)
+            yield dataclasses.replace(self, flat_radius=rim, tip_radius=tips, friction_margin=margin)
 
     @classmethod
     @checked

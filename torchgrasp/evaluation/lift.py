@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 LIFT_TIME = 1.0  # time [s] in which the hand rises
 PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre during the closing that counts as ejected
-LOST_DISTANCE = 0.5  # distance [m] of the object, beyond the lift, at which the trial ends
 SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
 """Motion [m, rad] of the object in the closed hand that counts as slipped."""
 
@@ -246,7 +245,7 @@ class _Lift:
         moved = self._moved()
         if not bool(torch.isfinite(tick.joints).all()) or not math.isfinite(moved):
             raise FloatingPointError
-        if moved > LOST_DISTANCE + self.spec.lift_height:
+        if moved > 0.5 + self.spec.lift_height:  # [m]
             self.pushed = self.pushed or moved
             raise _ObjectLost
 

@@ -56,6 +56,13 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
 
     Raises:
         BadArgument, MeshError, MissingExtra: as `close_hand`.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
+    >>> trial = GraspTrial(load_hand("allegro"), grasp, Truth(jug.mesh, jug.parts))
+    >>> [result.held for result in lift_grasps(trial, TrialSpec(hold_time=0.2))]
+    [True]
     """
     spec, grasps, tried, results = TrialSpec() if spec is None else spec, trial.grasp, [0], []
     while True:
