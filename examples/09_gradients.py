@@ -28,7 +28,7 @@ print(f"mean log-likelihood: {float(-loss.detach()):.2f} by descent, {float(em.l
 # 2. Forward kinematics, the shape's posterior and the posture model form one loss of the joints [rad].
 view = load_object("cylinder").view
 shape, model, grasp = fit_shape(view), load_mixture("barrett"), plan_grasps(view, hand, starts=30)[0]
-pose, joints = grasp.obj_from_hand.double(), (grasp.joints + 0.1).double()  # spoiled, so that there is something to do
+pose, joints = grasp.obj_from_hand.double(), (grasp.joints + 0.05).double()  # spoiled, so that there is something to do
 
 
 def loss_of(joints: torch.Tensor) -> torch.Tensor:

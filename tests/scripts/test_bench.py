@@ -63,7 +63,7 @@ def test_kernels_of_the_gpu_bench_agree_with_themselves():
 
 def test_benches_in_the_documentation_exist_or_have_a_commit():
     root = Path(__file__).parents[2]
-    cited = re.compile(r"bench\.py (\w+) --only ([a-z]+(?: [a-z]+)*)(.{0,130})", re.DOTALL)
+    cited = re.compile(r"bench\.py (\w+) --only ([a-z]+(?:[ -][a-z]+)*)(.{0,130})", re.DOTALL)
     for path in (*(root / "docs").rglob("*.md"), *root.glob("*/README.md")):
         for subject, names, after in cited.findall(path.read_text()):
             known = benches_of(subject) if subject in SUBJECTS else {}

@@ -15,6 +15,7 @@ from torchgrasp.app.cli.inputs import MOST_POINTS
 from torchgrasp.cloud.check import FEW_POINTS
 from torchgrasp.cloud.parts import GAP
 from torchgrasp.cloud.prepare import FACING
+from torchgrasp.control.holding import PUSH
 from torchgrasp.control.uncertainty_closing import STALLED
 from torchgrasp.evaluation.run import PLAN_LIMIT, TRIAL_LIMIT
 from torchgrasp.hand.collision_shapes import collision_pairs
@@ -31,10 +32,11 @@ FOUR = load_hand("allegro", "four")
 SPEC, TRIAL, MIB = ContactSpec(), TrialSpec(), 1024**2
 EXTENT = f"{1e3 * limits.MIN_EXTENT:.0f} mm to {limits.MAX_EXTENT:.0f} m"
 *WIDER, NARROWEST = (f"{1e3 * radius:.0f}" for radius in FLAT_RADII)
+LOWEST = [f"{1e3 * ContactSpec(friction=friction).least_height:.0f}" for friction in (0.8, 0.3)]
 POSTURES = inspect.signature(collision_pairs).parameters["n"].default
 CONSTANTS = {
     "README.md": (f"along a straight {TRIAL.approach:g} m", f"lifted by {TRIAL.lift_height:g} m"),
-    "docs/closing.md": (f"until its drives press with {STALLED:g} N",),
+    "docs/closing.md": (f"until its drives press with {STALLED:g} N", f"a push of {PUSH:g} N from any side"),
     "docs/clouds.md": (
         f"all but {MOST_POINTS // 1000} 000 points", f"an extent outside {EXTENT}", f"more than {100 * FACING:.0f} %",
         f"more than {1e3 * GAP:.0f} mm apart", f"{1e3 * GAP:.0f} mm apart, both", f"fewer than {FEW_POINTS} points",
@@ -43,6 +45,7 @@ CONSTANTS = {
     "docs/fingers.md": (f"whose {BEST} best grasps", f"{','.join(FOUR.finger_names)} {FOUR.dof}"),
     "docs/hands.md": (f"in {POSTURES:,} random postures",),
     "docs/limits.md": (
+        f"{LOWEST[0]} mm at friction 0.8, {LOWEST[1]} mm at friction 0.3",
         f"| {limits.CLOUD_POINTS // 10**6} million, {limits.CLOUD_BYTES // MIB} MB |", f"| {EXTENT} |",
         f"each of {limits.LINE_LETTERS} letters and {limits.TEXT_COLUMNS} numbers", f"| {MAX_BUDGET} observations |",
         f"| {PLAN_LIMIT:.0f} s and {TRIAL_LIMIT:.0f} s;", f"| {limits.HAND_SHAPE_PAIRS:,}; a cylinder",
@@ -50,6 +53,7 @@ CONSTANTS = {
         f"| {limits.PATH_BYTES} bytes, {limits.NAME_BYTES} bytes |",
     ),
     "docs/planning.md": (
+        f"At friction 0.8 grasps are sought from {LOWEST[0]} mm of height",
         f"| `friction_margin` | {SPEC.friction_margin:g} |", f"| `flatness` | {SPEC.flatness:g} rad |",
         f"the widest of {', '.join(WIDER)} and {NARROWEST} mm", f"the hand's, at least {1e3 * TIP_RADIUS:.0f} mm",
         f"their width and {1e3 * (SEPARATION - 2 * TIP_RADIUS):.0f} mm",
