@@ -70,11 +70,16 @@ def test_an_object_where_it_was_seen_is_held_at_once(seen):
     assert (result.attempts, result.stops, result.held) == (1, 0, True)
 
 
-@pytest.mark.parametrize("aside", [0.020, -0.022])
+@pytest.mark.parametrize("aside", [0.022, 0.026, -0.024, -0.03])
 def test_a_hand_that_closed_beside_the_object_closes_once_more(seen, aside):
-    """The object stands off along its own tangents at the contacts: no plane there tells it, its round surface does."""
+    """The object stands off along its own tangents at the contacts: no plane there tells it, its round surface does.
+
+    The first closing rocks the object, and in SAPIEN a rocking cylinder gains energy until it falls over.
+    """
+    pytest.importorskip("mujoco")
+    spec = dataclasses.replace(STILL, simulator="mujoco")
     once, again = (
-        close("allegro", cylinder((aside, 0.0)), dataclasses.replace(STILL, options=options), surface=seen)
+        close("allegro", cylinder((aside, 0.0)), dataclasses.replace(spec, options=options), surface=seen)
         for options in (ClosingOptions(attempts=1), None)
     )
     assert (once.attempts, once.held) == (1, False)
@@ -149,7 +154,7 @@ def test_an_object_that_slips_in_the_hand_is_not_held(monkeypatch):
     slipped = trial.result(Status.OK, 0.0).slip
     for name, limit in (("SLIP_DISTANCE", slipped.distance), ("SLIP_ANGLE", slipped.angle)):
         with monkeypatch.context() as patched:
-            patched.setattr(f"torchgrasp.evaluation.lift.{name}", 0.99 * limit)
+            patched.setattr(f"torchgrasp.evaluation.criterion.{name}", 0.99 * limit)
             assert trial._verdict() is Status.SLIPPED
 
 

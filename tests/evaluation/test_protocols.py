@@ -2,12 +2,14 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 from tests.make import near, real
 from tests.pinch import cylinder, pinch
+from torchgrasp.app.cli.evaluate import Evaluate
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import (
     PROTOCOLS,
@@ -106,3 +108,16 @@ def test_settings_of_lifts_and_pulls_do_not_mix():
         lift.with_trial(table_friction=0.9)
     with pytest.raises(BadArgument, match="push"):
         lift.with_trial(push=(0.0, 0.0, math.inf))
+
+
+def test_the_command_line_changes_only_what_was_asked_for_and_displaces_no_object_of_a_pull():
+    def disturbed(name, **options):
+        asked = Evaluate(objects=Path("objects"), hand="allegro", out=Path("out"), **options)
+        return asked.disturbed(find_protocol(name))
+
+    assert all(disturbed(name) == find_protocol(name) for name in PROTOCOLS)
+    assert disturbed("pose-noise", draws=1).noise == dataclasses.replace(find_protocol("pose-noise").noise, draws=1)
+    moved = disturbed("table-lift", displaced=0.03, during=True, push=2.5, draws=5)
+    assert (moved.noise, moved.displaced, moved.push) == (PoseNoise(0.03, 0.0, 5), "approach", 2.5)
+    with pytest.raises(BadArgument, match="--displaced"):
+        disturbed("dexgraspbench", displaced=0.03)

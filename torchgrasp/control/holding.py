@@ -19,7 +19,6 @@ MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a senso
 RAMP = 0.4  # time [s] in which the forces rise to the desired forces
 MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations of its reading
 PRIOR_STD, MIN_STD = 0.2, 0.03  # standard deviation of the friction estimate at the start, and its least value
-FORCE_LAG = 0.03  # time [s] of sliding until the filtered forces show the friction
 LIFTED = 0.35  # load [N] from which the object counts as lifted
 PUSH = 2.5  # force [N] from any side at the object's centre that a grip withstands without pressing harder
 
@@ -137,6 +136,11 @@ class GripHold:
         """The size of the force [N] with which the object loads the fingertips, as they feel it."""
         return float(np.linalg.norm(self.load[:3]))
 
+    @property
+    def sliding(self) -> np.ndarray:
+        """A mask of the fingers that have slid for so long that the filtered forces show the friction."""
+        return self.slid > 0.03  # [s]
+
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
@@ -184,13 +188,12 @@ class GripHold:
 
     def _adapt(self, observation: Observation, period: float) -> None:
         """Update the friction estimate by sliding fingers, and reduce forces that are not needed."""
-        speed, sliding = observation.tactile.sliding.numpy(), 0.008  # [m/s]
-        slides = (speed > sliding) & observation.tactile.contact.numpy()
+        slides = (observation.tactile.sliding.numpy() > 0.008) & observation.tactile.contact.numpy()  # [m/s]
         self.slid = np.where(slides, self.slid + period, 0.0)
         if self.time < RAMP:
             return
         push, ratios = -(self.felt * self.normals).sum(-1), friction_ratios(self.felt, self.normals)
-        for i in np.flatnonzero((self.slid > FORCE_LAG) & (push > 0.5 * MIN_PUSH)):
+        for i in np.flatnonzero(self.sliding & (push > 0.5 * MIN_PUSH)):
             self.friction.update(float(min(ratios[i], 2.0)), float(push[i]))
         self._release(period)
 
@@ -210,7 +213,7 @@ class GripHold:
         self.cover = min(max(self.cover + fastest * (2 if share < 0.95 else -4), 0.0), 1.0)
         goal = self.friction.high if share > 1.0 and self.cover == 0.0 else self.friction.mean
         self.aim += min(max(goal - self.aim, -fastest), fastest)
-        beyond = share > 0.95 and self.cover == 0.0 and bool((self.slid > FORCE_LAG).any())
+        beyond = share > 0.95 and self.cover == 0.0 and bool(self.sliding.any())
         self.over = self.over + period if beyond and self.weight > LIFTED else 0.0
         if self.over > 0.25:  # [s]
             self.status = Status.TOO_HEAVY

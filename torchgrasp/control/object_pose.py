@@ -104,7 +104,7 @@ class Touches:
     @property
     def felt(self) -> Bool[Tensor, "f"]:
         """A mask of the fingertips that touch the object and have reported where they touch."""
-        return (self.contact | torch.full_like(self.contact, self.kept)) & (self.count > 0)
+        return (self.contact | self.kept) & (self.count > 0)
 
     def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
         """Return each fingertip's mean contact point [m] and unit normal; zero for fingertips without contact."""

@@ -88,10 +88,8 @@ class GuardedApproach:
         links = self._touching_links(observation)
         if self.stops < self.options.stops and (bool(observation.tactile.contact.any()) or len(links)):
             self.speed, self.time, self.feeling = 0.0, 0.0, True
-            self.touches, self.search = (
-                Touches(self.reference, links),
-                Localization(self.reference, self.displacement[:3]),
-            )
+            self.touches = Touches(self.reference, links)
+            self.search = Localization(self.reference, self.displacement[:3])
             self.touches.add(observation, self.palm - self.left * self.direction)
         else:
             braking = math.sqrt(2 * ACCELERATION * self.left)  # the speed from which the hand just stops in time

@@ -11,7 +11,8 @@ from torch import Tensor
 from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
 from torchgrasp.errors import Status
-from torchgrasp.evaluation.lift import LIFT_TIME, SLIP_ANGLE, SLIP_DISTANCE
+from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
+from torchgrasp.evaluation.lift import LIFT_TIME
 from torchgrasp.evaluation.regrasp import next_grasp
 from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle

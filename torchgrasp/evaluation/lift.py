@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, map_tensors
+from torchgrasp.base import map_tensors
 from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.cloud.agreement import check_agreement, check_stand
-from torchgrasp.control import TipContact
 from torchgrasp.control.reference import check_single
 from torchgrasp.errors import Status
+from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
-from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 LIFT_TIME = 1.0  # time [s] in which the hand rises
 PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre during the closing that counts as ejected
-SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
-"""Motion [m, rad] of the object in the closed hand that counts as slipped."""
 
 
 @checked
@@ -119,56 +117,12 @@ class _ObjectLost(Exception):
     """Raised when the object is too far away to continue the trial."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Tick(Value):
-    """The state of the simulation at one control tick; with a leading axis, the states at all ticks.
-
-    `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `felt` holds the controller's
-    estimates of friction and load [N], `truth` the true contacts.
-    """
-
-    time: Float[Tensor, "*t"]
-    object_pose: Float[Tensor, "*t 4 4"]
-    hand_pose: Float[Tensor, "*t 4 4"]
-    neighbour_pose: Float[Tensor, "*t m 4 4"]
-    joints: Float[Tensor, "*t j"]
-    touching: Int[Tensor, "*t"]
-    centre: Float[Tensor, "*t 3"]
-    felt: Float[Tensor, "*t 2"]
-    blend: Float[Tensor, "*t f"]
-    truth: TipContact
-
-
-def judge_lift(ticks: Sequence[_Tick], pressed: int, judged: int, lift_height: float) -> Status:
-    """Return whether an object was held in a lift of some height [m]: `OK`, `SLIPPED`, `DROPPED` or `NOT_LIFTED`.
-
-    It is held if its centre rose by half of the lift, two fingers touch it in most of the last `judged` ticks, and it
-    slipped less than the limits since the tick `pressed`.
-    """
-    half = 0.5 * lift_height
-    rise = [float(tick.centre[2] - ticks[0].centre[2]) for tick in ticks]
-    gripped = [bool(tick.touching >= 2) for tick in ticks[-judged:]]
-    if rise[-1] >= half and sum(gripped) > 0.5 * len(gripped):
-        slip = _motion_between(ticks[pressed], ticks[-1])
-        return Status.OK if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE else Status.SLIPPED
-    return Status.DROPPED if max(rise) >= half else Status.NOT_LIFTED
-
-
-def _motion_between(first: _Tick, last: _Tick, in_hand: bool = True) -> ObjectMotion:
-    """Return the motion of the object's centre and its rotation between two ticks, relative to the hand or world."""
-    eye = torch.eye(4, dtype=torch.float64)
-    start, end = (inverse(tick.hand_pose) if in_hand else eye for tick in (first, last))
-    centres = apply(torch.stack([start, end]), torch.stack([first.centre, last.centre])[:, None])[:, 0]
-    turned = (start @ first.object_pose)[:3, :3].T @ (end @ last.object_pose)[:3, :3]
-    return ObjectMotion(float(torch.linalg.vector_norm(centres[1] - centres[0])), float(rotation_angle(turned)))
-
-
 class _Lift:
     """One lift trial and the record of its ticks."""
 
     def __init__(self, run: TrialRun) -> None:
         self.run, self.spec = run, run.spec
-        self.ticks: list[_Tick] = []
+        self.ticks: list[Tick] = []
         self.arrived, self.pushed, self.strained, self.unbalanced = 0, 0.0, False, math.nan
         self.touched: int | None = None
         self.pressed: int | None = None
@@ -240,7 +194,7 @@ class _Lift:
             np.float64(robot.steps * self.spec.timestep), pose, scene.hand_pose(), scene.neighbour_poses(),
             scene.joints(), robot.finger.sum(), pose[:3, :3] @ scene.centre + pose[:3, 3], np.array(self.run.felt),
         )  # fmt: skip
-        tick = _Tick(*map(torch.as_tensor, arrays), blend=self.run.controller.blend, truth=robot.truth)
+        tick = Tick(*map(torch.as_tensor, arrays), blend=self.run.controller.blend, truth=robot.truth)
         self.ticks.append(tick)
         moved = self._moved()
         if not bool(torch.isfinite(tick.joints).all()) or not math.isfinite(moved):
@@ -273,7 +227,7 @@ class _Lift:
         """Return the object's motion between two ticks, relative to the hand or the world; NaN if a tick is None."""
         if first is None or last is None:
             return ObjectMotion(math.nan, math.nan)
-        return _motion_between(self.ticks[first], self.ticks[last], in_hand)
+        return motion_between(self.ticks[first], self.ticks[last], in_hand)
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record of the trial as a `ClosureResult`."""

@@ -147,5 +147,4 @@ def run_protocol(
         cause, size = find_cause(lift, trial, protocol.trial, before)
     spent = time.process_time() - started
     measured = moved, turned, force, overlap, spent, *slip
-    held = status is Status.OK
-    return ProtocolResult(rank, draw, passed, status, *measured, held=held, tries=tries, cause=cause, size=size)
+    return ProtocolResult(rank, draw, passed, status, *measured, tries=tries, cause=cause, size=size)

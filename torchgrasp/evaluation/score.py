@@ -44,7 +44,6 @@ class ProtocolResult(Value):
         slip: motion of the object in the closed hand [m], in a lift.
         slip_angle: rotation of the object in the closed hand [rad], in a lift.
         predicted: predicted success of the grasp.
-        held: whether the status is `OK`: in a lift the object is then held without slip (`close_hand`).
         tries: number of grasps that were tried; all but `predicted`, `rank` and `overlap` is of the last grasp.
         cause: why the object of a lift was not held, a name in `CAUSES`, or "".
         size: size of the cause, in the cause's unit.
@@ -62,10 +61,14 @@ class ProtocolResult(Value):
     slip: Measured = math.nan
     slip_angle: Measured = math.nan
     predicted: Measured = math.nan
-    held: bool = False
     tries: Count = 1
     cause: str = ""
     size: Measured = math.nan
+
+    @property
+    def held(self) -> bool:
+        """Whether the status is `OK`: in a lift the object is then held without slip (`close_hand`)."""
+        return self.status is Status.OK
 
 
 @checked

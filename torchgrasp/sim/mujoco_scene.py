@@ -152,7 +152,7 @@ def scene_mjcf(spec: SceneSpec) -> str:
     option = ET.SubElement(root, "option", OPTION, timestep=repr(spec.timestep), gravity=f"0 0 {-spec.gravity!r}")
     ET.SubElement(option, "flag", multiccd="enable", autoreset="disable")
     default = ET.SubElement(root, "default")
-    friction, slick = (format_numbers((x, x * spec.patch, 0.0)) for x in (spec.friction, spec.slickness))
+    friction, slick = (format_numbers((x, x * spec.patch, 0.0)) for x in (spec.friction, spec.body_friction))
     condim = "4" if spec.patch > 0 else "3"
     ET.SubElement(default, "geom", friction=friction, condim=condim, solref=SOLREF, solimp=SOLIMP)
     ET.SubElement(default, "joint", solreflimit=SOLREF)

@@ -143,8 +143,8 @@ class SapienScene(Scene):
         super().__init__(spec)
         sapien, physx = import_sapien()
         self.system, self.scene = open_world(sapien, physx, spec.gravity, spec.timestep)
-        slick = physx.PhysxMaterial(spec.slickness, spec.slickness, 0.0)
-        both = 2 * spec.friction - spec.slickness  # PhysX averages the coefficients of two bodies
+        slick = physx.PhysxMaterial(spec.body_friction, spec.body_friction, 0.0)
+        both = 2 * spec.friction - spec.body_friction  # PhysX averages the coefficients of two bodies
         grip = physx.PhysxMaterial(both, both, 0.0)
         if spec.table:
             place(sapien, self.scene, "table", table(physx, slick), spec.table_height - TABLE[2] / 2)

@@ -139,7 +139,7 @@ class SceneSpec:
         return Body(self.mesh, self.parts, self.mass)
 
     @property
-    def slickness(self) -> float:
+    def body_friction(self) -> float:
         """The friction coefficient of bodies with the table and each other."""
         return self.friction if self.table_friction is None else self.table_friction
 

@@ -66,22 +66,30 @@ class Evaluate(_Trials):
         None, 'how the hand presses after closing; by default as the protocol says, or "force" with --force'
     )
     force: float | None = option(None, "normal force of the strongest finger [N]; by default as the protocol says")
-    displaced: float = option(0.0, "lifts: most that the object is displaced along each axis of the table [m]")
+    displaced: float | None = option(
+        None,
+        "lifts: most that the object is displaced on each axis of the table [m]; by default as the protocol says",
+    )
     during: bool = option(False, "displace the object halfway through the approach, not before it")
     relook: bool = option(False, "lifts: a camera looks at the displaced object once more, before the approach")
-    push: float = option(0.0, "lifts: size of a force in a random direction on the lifted object [N]")
-    draws: Count = option(1, "trials of each grasp, with other displacements, pushes and sensor noise")
+    push: float | None = option(None, "lifts: size of a force in a random direction on the lifted object [N]")
+    draws: Count | None = option(
+        None, "trials of each grasp, with other displacements, pushes and noise; by default as the protocol says"
+    )
     complete: bool = option(False, "plan on the whole cloud instead of each view")
     planned: Path | None = option(None, 'folder "grasps" of an earlier run, whose grasps are tested')
     workers: int = option(1, "processes; the results do not depend on their number")
 
     def disturbed(self, test: evaluation.Protocol) -> evaluation.Protocol:
         """Return a protocol with the displacements, pushes and draws that the user set."""
-        noise = {"translation": self.displaced, "rotation": 0.0} if self.displaced else {}
-        noise = dataclasses.replace(test.noise, **noise | ({"draws": self.draws} if self.draws > 1 else {}))
-        changes = {"displaced": "approach"} if self.during else {}
-        changes |= {"relook": True} if self.relook else {}
-        return dataclasses.replace(test, noise=noise, push=self.push or test.push, **changes)
+        noise = test.noise if self.draws is None else dataclasses.replace(test.noise, draws=self.draws)
+        if self.displaced is not None:
+            if test.pull is not None:
+                raise BadArgument("--displaced", self.displaced, f"a protocol that lifts, not {test.name}")
+            noise = dataclasses.replace(noise, translation=self.displaced, rotation=0.0)
+        push, relook = test.push if self.push is None else self.push, self.relook or test.relook
+        when = "approach" if self.during else test.displaced
+        return dataclasses.replace(test, noise=noise, push=push, relook=relook, displaced=when)
 
     def run(self) -> int:
         """Evaluate the objects, write the results and print the summary; return the exit code."""

@@ -15,7 +15,8 @@ from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
-from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE, SLIP_ANGLE, SLIP_DISTANCE
+from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
+from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
