@@ -10,7 +10,7 @@ from torchgrasp.errors import BrokenLaw
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.sim.scene import Scene
+from torchgrasp.sim.scene import STILL, Scene
 from torchgrasp.sim.scene_spec import SceneSpec
 
 Open = Callable[[SceneSpec], Scene]
@@ -32,6 +32,7 @@ def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
     * `joints`: `joint_names` are the movable joints of the URDF, which start where the specification says.
     * `kinematics`: root, fingertips and Jacobian are those of the hand, and nothing overlaps.
     * `rest`: an object on the table stays where it stands, and nothing is touched.
+    * `rock`: a cylinder tipped by few degrees stands again on the table.
     * `fall`: without a table it falls by g t^2 / 2.
     * `pull`: a force at the mass centre of a weightless object moves it by F t^2 / (2 m) and turns it nowhere.
     * `slide`: an object on the table slides only under a force beyond friction; `displace` moves the object.
@@ -109,6 +110,11 @@ class _Laws:
             if step.finger.any() or step.weight.any() or step.stray.any():
                 raise BrokenLaw("rest", "contacts of a hand far from everything", "none")
         compare("rest", "the object on the table", scene.object_pose(), np.eye(4), POSE)
+        rocking, tip = self.scene(), np.array([0.0, 1.2 * MASS * self.spec.gravity * RADIUS, 0.0])
+        for k in range(2 * STEPS):
+            rocking.pull(STILL, tip if k < STEPS // 5 else STILL)
+            rocking.step()
+        compare("rock", "the object on the table", rocking.object_pose()[:3, 2], np.array([0.0, 0.0, 1.0]), 0.05)
         falling = self.scene(table=False)
         for _ in range(STEPS):
             falling.step()

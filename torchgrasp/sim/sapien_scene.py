@@ -11,6 +11,7 @@ Settings that differ from SAPIEN's defaults:
 """
 
 import functools
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -23,7 +24,6 @@ from torchgrasp.sim.scene import STILL, ContactPoint, Scene, StepContacts
 from torchgrasp.sim.scene_spec import (
     ARMATURE,
     MOUNT_DRIVE,
-    TABLE,
     WRIST_JOINT,
     Body,
     SceneSpec,
@@ -52,10 +52,11 @@ def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) ->
     scene.add_entity(entity)
 
 
-def table(physx: Any, material: Any) -> Any:
-    """Return the body of the table, a static box."""
-    body = physx.PhysxRigidStaticComponent()
-    body.attach(physx.PhysxCollisionShapeBox(np.array(TABLE, np.float32) / 2, material))
+def table(sapien: Any, physx: Any, material: Any) -> Any:
+    """Return the body of the table, a half space; on a box, a rocking object gains energy until it falls over."""
+    body, top = physx.PhysxRigidStaticComponent(), physx.PhysxCollisionShapePlane(material)
+    top.set_local_pose(sapien.Pose(q=[math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0]))  # its normal is its x axis
+    body.attach(top)
     return body
 
 
@@ -147,7 +148,7 @@ class SapienScene(Scene):
         both = 2 * spec.friction - spec.body_friction  # PhysX averages the coefficients of two bodies
         grip = physx.PhysxMaterial(both, both, 0.0)
         if spec.table:
-            place(sapien, self.scene, "table", table(physx, slick), spec.table_height - TABLE[2] / 2)
+            place(sapien, self.scene, "table", table(sapien, physx, slick), spec.table_height)
         solids = zip((spec.body, *spec.neighbours), spec.hulls, strict=True)
         bodies = [rigid_body(sapien, physx, slick, body, hulls, spec.patch) for body, hulls in solids]
         for k, body in enumerate(bodies):

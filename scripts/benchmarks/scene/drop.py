@@ -22,7 +22,7 @@ from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.sim.convex_parts import convex_parts, hull
 from torchgrasp.sim.sapien_scene import import_sapien, open_world, place, rigid_body, table
-from torchgrasp.sim.scene_spec import TABLE, Body
+from torchgrasp.sim.scene_spec import Body
 from torchgrasp.specs import TrialSpec
 
 MASS = 0.1
@@ -59,7 +59,7 @@ class SettlingTable:
         self._sapien, self._physx = import_sapien()
         self._system, self._scene = open_world(self._sapien, self._physx, 9.81, timestep)
         self._material = self._physx.PhysxMaterial(0.8, 0.8, 0.0)
-        place(self._sapien, self._scene, "table", table(self._physx, self._material), -TABLE[2] / 2)
+        place(self._sapien, self._scene, "table", table(self._sapien, self._physx, self._material))
         self._damping, self._timestep = damping, timestep
         self._bodies: list[Any] = []
 
