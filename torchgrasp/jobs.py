@@ -32,15 +32,11 @@ def run_tasks(
     """Run `function(*task)` for each task in worker processes; yield the results in the order of the tasks.
 
     Each task runs on one thread of a separate process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task
-    whose process dies twice gives `Status.WORKER_DIED`. All workers end when the caller stops iterating.
+    whose process dies twice gives `Status.WORKER_DIED`. The error of a task is raised in place of its result. All
+    workers end when the caller stops iterating.
 
     Each worker imports the module of the function. Tasks must hold no tensors, because processes would share them. If
     `workers` is 0, the tasks run in this process, without the `limit` [s] on the time of a task.
-
-    Raises:
-        BadArgument: workers outside [0, 1024], or a limit below 1 ms.
-        MissingExtra: pebble is not installed.
-        Exception: the error of a task, raised in place of its result.
     """
     return _in_order(_run(function, tasks, workers, limit))
 

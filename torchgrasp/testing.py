@@ -47,10 +47,8 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
         raise fault
     joints = random_joints(hand, FK_POSTURES)
     if not bool((hand.self_clearance(joints) > 0).any()):
-        one, two = most_met(hand, joints)
-        found = (
-            f"{find_hand(name_or_path)}: links that meet in all of {FK_POSTURES} random postures, as {one} and {two}"
-        )
+        met = " and ".join(most_met(hand, joints))
+        found = f"{find_hand(name_or_path)}: links that meet in all of {FK_POSTURES} random postures, as {met}"
         raise HandFileError("hand.toml", found, "parked joints, shapes or pairs of self_collision by which they part")
     worst, link = largest_fk_error(hand, joints)
     if not worst < FK_TOLERANCE:

@@ -70,9 +70,8 @@ def _work(view: View, hand: Hand, protocol: Protocol, spec: EvaluationSpec) -> S
     passed = torch.tensor([x.passed for x in tries], dtype=torch.bool).reshape(len(ranks), len(draws))
     outcome = torch.tensor([int(x.status) for x in tries], dtype=torch.int64).reshape(passed.shape)
     eye = torch.zeros(3, dtype=torch.float64) if cloud.viewpoint is None else cloud.viewpoint.double()
-    row = row._replace(
-        executable=len(found), points=len(cloud), grasps=len(ranks), passed=int(passed.sum()), meta=found.meta
-    )
+    counts = {"executable": len(found), "points": len(cloud), "grasps": len(ranks), "passed": int(passed.sum())}
+    row = row._replace(**counts, meta=found.meta)
     return Shard((row,), Records(cloud.points.double(), eye[None], grasps, passed, outcome))
 
 
@@ -89,12 +88,8 @@ def run_on_cluster(
 
     A task whose worker dies is given to another worker; after the deaths that the scheduler allows
     (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task that takes longer
-    than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. Tasks wait until a worker is free.
-
-    Raises:
-        MissingExtra: Dask is not installed.
-        BadArgument: no scheduler answers at the address, or the scheduler ends.
-        Exception: the error of a task, when the task ends.
+    than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. Tasks wait until a worker is free. Without Dask,
+    `MissingExtra` is raised; without a scheduler at the address, `BadArgument`.
     """
     try:
         from distributed import CancelledError, Client, Event, KilledWorker, as_completed
@@ -108,9 +103,8 @@ def run_on_cluster(
     with client:
         run = uuid.uuid4().hex
         names = [f"torchgrasp-late-{run}-{k}" for k in range(len(tasks))]
-        futures = {
-            client.submit(_bounded, function, limit, names[k], *task, pure=False): k for k, task in enumerate(tasks)
-        }
+        shared = _bounded, function, limit
+        futures = {client.submit(*shared, names[k], *task, pure=False): k for k, task in enumerate(tasks)}
         try:
             for future in as_completed(list(futures), loop=client.loop):
                 number = futures.pop(future)
@@ -131,10 +125,7 @@ def run_on_cluster(
 
 
 def _bounded(function: Callable[..., Result], limit: float, name: str, *task: Any) -> Result | Status:
-    """Call a function on one thread of a worker process; end the process if the call takes longer than `limit` [s].
-
-    Nothing else can stop a simulator. An event on the scheduler tells the next worker that the task was late.
-    """
+    """Call a function on one thread of a worker process; end the process if the call takes longer than `limit` [s]."""
     from distributed import Event
 
     late = Event(name)

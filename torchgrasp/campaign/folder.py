@@ -44,14 +44,11 @@ FIELDS = (
 
 
 class Campaign(NamedTuple):
-    """The request of a campaign, as in `campaign.json`, and one row for each job (one view of one object).
-
-    A job whose row has a status other than OK is not run. `empty` makes the data of a job without grasps from its row.
-    """
+    """The request of a campaign, as in `campaign.json`, and one row for each job (one view of one object)."""
 
     asked: dict[str, Any]
-    rows: tuple[JobRow, ...]
-    empty: Callable[[JobRow], Shard]
+    rows: tuple[JobRow, ...]  # a job whose row has a status other than OK is not run
+    empty: Callable[[JobRow], Shard]  # makes the data of a job without grasps from its row
 
     @property
     def text(self) -> str:
@@ -68,11 +65,7 @@ class Campaign(NamedTuple):
 def carry_out(
     campaign: Campaign, folder: Path, work: Work, observer: Callable[[JobRow], object] = lambda row: None
 ) -> GraspShards:
-    """Run the jobs that are not yet in a folder, and write its data set; the observer gets each finished job's row.
-
-    Raises:
-        OutputError: the folder holds another campaign or other files, another run holds it, or it cannot be written.
-    """
+    """Run the jobs that a folder lacks, and write its data set; the observer gets the row of each finished job."""
     with hold_folder(folder):
         begin_folder(folder / ASKED, campaign.text, "campaigns")
         store = _Store(campaign, folder)

@@ -43,12 +43,8 @@ def judge_view(
 ) -> list[Advice]:
     """Return advice on a cloud's camera, vertical and table, and on other bodies left in; refusals come first.
 
-    Args:
-        cloud: distinct points [m], with the given normals and viewpoint, if any.
-        clean: the same cloud cleaned, with outward normals and perhaps an estimated viewpoint.
-        up: unit vector that points up.
-        table: plane of the table; None if the table is assumed at the lowest point.
-        stands: whether the object stands on a table.
+    `clean` is the cloud cleaned, with outward normals and perhaps an estimated viewpoint. A `table` of None is assumed
+    at the lowest point. `stands` tells whether the object stands on a table.
     """
     assert clean.normals is not None
     points, normals = clean.points.double(), clean.normals.double()
@@ -66,9 +62,8 @@ def judge_view(
         try:
             check_foot(cloud, table)
         except BadArgument as error:
-            advice.append(
-                Advice(f"a table that contradicts the cloud, {error.found}", f"--table, {error.allowed}", True)
-            )
+            found = f"a table that contradicts the cloud, {error.found}"
+            advice.append(Advice(found, f"--table, {error.allowed}", True))
     if stands and eye is not None and facing >= FACING:
         advice += _judge_height(points, eye, given, up, table, support)
         down = float((normals @ up < -0.5).double().mean())

@@ -28,9 +28,6 @@ def check_agreement(
     """Raise `BadArgument` if points lie off a mesh, or off a cloud and the space hidden behind the cloud.
 
     At most the fraction `share` of the points may be farther than `slack` [m] from `other`, the mesh or the cloud.
-
-    >>> from trimesh.creation import icosphere
-    >>> check_agreement("mesh", torch.eye(3), "points", icosphere(), slack=0.02, share=0.2)
     """
     points = points.detach().cpu().double()
     points = points[draw_rows(len(points), 300)]
@@ -74,16 +71,12 @@ def _noise(cloud: PointCloud) -> float:
 
 
 def _distance_behind(points: Float[Tensor, "n 3"], cloud: PointCloud) -> Float[Tensor, "n"]:
-    """Return the distance [m] of each point from a cloud, including the space that the cloud hides behind it.
-
-    The hidden space is as deep as the cloud is long. If the camera is unknown, the space within half of this length
-    around the cloud counts as hidden.
-    """
+    """Return each point's distance [m] from a cloud and the space hidden behind it, as deep as the cloud is long."""
     rows = draw_rows(len(cloud), 500)
     seen = cloud.points[rows].double().cpu()
     length = float(torch.linalg.vector_norm(seen.amax(0) - seen.amin(0)))
     away = points[:, None] - seen
-    if cloud.viewpoint is None:
+    if cloud.viewpoint is None:  # the space around the cloud counts as hidden
         return (torch.linalg.vector_norm(away, dim=-1).amin(1) - length / 2).clamp_min(0)
     eye = cloud.viewpoint.double().cpu()
     ray = unit(seen - (eye if eye.ndim == 1 else eye[rows]))

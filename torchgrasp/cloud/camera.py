@@ -149,18 +149,7 @@ def render_depth(
     """Return a depth image [m] of meshes on a table, as the default camera measures it, and true pixel labels.
 
     Depth is 0 where nothing was measured. Label 0 is the table or nothing, label k is mesh k - 1. The table is a disc
-    of radius 0.6 m about the origin.
-
-    Args:
-        meshes: surfaces of the objects, in the world frame [m].
-        camera_pose: transform world_from_camera (4 x 4), see `look_at`.
-        table: height z of the table [m]; None for no table.
-        noise: True for the default noise, False for exact depths, the name of a camera, or a `SensorNoise`.
-        seed: random seed of the noise.
-
-    Raises:
-        BadArgument: a pose that is not rigid.
-        MeshError: a mesh has no faces.
+    of radius 0.6 m about the origin at the height `table` [m]; None means no table. `noise` is that of `partial_view`.
     """
     pose = check_rigid("camera_pose", camera_pose).double()
     depth = torch.full((HEIGHT, WIDTH), torch.inf, dtype=torch.float64)

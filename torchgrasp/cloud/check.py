@@ -37,10 +37,7 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 
 @checked
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
-    """Check a cloud, and return it without duplicate points, which would count as independent measurements.
-
-    Of points closer together than 1e-9 of the extent, only the first is kept. Raises the errors of `check_cloud`.
-    """
+    """Check a cloud, and return it without duplicate points, which would count as independent measurements."""
     points = _check(cloud)
     rows = _distinct_rows(points)
     _check_distinct(points, rows)

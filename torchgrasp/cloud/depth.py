@@ -247,10 +247,7 @@ def _wrong_numbers(k: Float[Tensor, "3 3"], size: Sequence[int]) -> tuple[str, s
 
 
 def _wrong_size(k: Float[Tensor, "3 3"], stated: list[float] | None, size: Sequence[int]) -> tuple[str, str] | None:
-    """Return the error and its fix if intrinsics belong to another resolution; None if they fit the image or a crop.
-
-    If no size is stated, twice the principal point is compared with multiples of the image's size and common sizes.
-    """
+    """Return the error and its fix if intrinsics belong to another resolution; None if they fit the image or a crop."""
     height, width = size
     image, centre = k.new_tensor([width, height]), 2 * k[:2, 2]
     if stated is not None:
@@ -260,7 +257,7 @@ def _wrong_size(k: Float[Tensor, "3 3"], stated: list[float] | None, size: Seque
         if torch.equal(own, image) or (inside and bool((corner.abs() > 0.04 * own).any())):
             return None
         found = f"those of an image of {own[0]:g} x {own[1]:g} px for an image of {width} x {height}"
-    else:
+    else:  # the principal point is about the middle of an image of a common size
         scales = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
         modes = ((320, 240), (424, 240), (480, 270), (512, 424), (640, 360), (640, 480), (640, 576), (848, 480))
         modes += ((960, 540), (1024, 768), (1280, 720), (1280, 960), (1920, 1080), (1944, 1200), (2048, 1536))

@@ -12,9 +12,6 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
     """Return points, normals and viewpoint of a PCD file, None if missing, and whether the viewpoint is `default`.
 
     Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0`, wherever the camera was.
-
-    Raises:
-        ValueError: no PCD file; fewer bytes than the header promises; malformed compressed data.
     """
     header, body = _split_header(data)
     names = header["FIELDS"]
@@ -81,13 +78,10 @@ def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
 
 
 def decompress(data: bytes, size: int) -> bytes:
-    """Return the `size` bytes to which LZF-compressed data expand.
+    """Return the `size` bytes to which LZF-compressed data expand; raise `ValueError` for malformed data.
 
     A control byte c < 32 is followed by c + 1 literal bytes. A larger c means a copy of (c >> 5) + 2 earlier bytes; a
     length of 9 is extended by the next byte. The distance back to the copied bytes has 13 bits.
-
-    Raises:
-        ValueError: data that end early, hold more or fewer bytes, or copy bytes from before their start.
     """
     out, i, end = bytearray(), 0, len(data)
     while i < end:

@@ -17,11 +17,7 @@ TYPES = {
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals, viewpoint, frustum and table of a PLY file by name; entries that it lacks are None.
-
-    Raises:
-        ValueError: no PLY file; fewer bytes than the header promises.
-    """
+    """Return points, normals, viewpoint, frustum and table of a PLY file by name; entries that it lacks are None."""
     header, body = _split_header(data)
     encoding, viewpoint, frustum, table = "", None, None, None
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []

@@ -66,11 +66,7 @@ def check_distance(pose: Float[Tensor, "4 4"], distance: float, most: float, wha
 
 
 def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
-    """Return the rigid transform in a file: .npy, or .txt with four rows of four numbers.
-
-    Raises:
-        BadArgument: no such file, another suffix, malformed content, or no rigid transform.
-    """
+    """Return the rigid transform in a .npy file, or in a .txt file with four rows of four numbers."""
     data, suffix = read_suffixed(name, path, (".npy", ".txt"))
     try:
         table = parse_npy(data) if suffix == ".npy" else read_lines(data)
@@ -83,10 +79,7 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
 def find_plausible(
     points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], table: Plane | float | None, up: object, known_unit: bool
 ) -> tuple[Support, ...]:
-    """Return the planes on which objects may stand; refuse a pose or a depth unit that contradicts the view.
-
-    `known_unit` says whether the user stated the unit of the depth.
-    """
+    """Return the planes on which objects may stand; refuse a pose or a depth unit that contradicts the view."""
     eye = pose[:3, 3]
     try:
         supports = find_table(points, eye, table, up)
@@ -129,10 +122,7 @@ def _check_supports(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], u
 
 
 def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up: object) -> None:
-    """Refuse a pose by which the table is upside down, or is tilted but would be level by another pose convention.
-
-    Other tilts are accepted, because the frame itself may be tilted.
-    """
+    """Refuse a pose with the table upside down, or tilted where another pose convention would make it level."""
     sky = torch.tensor([0.0, 0.0, 1.0]).double() if up is None else unit(torch.as_tensor(up).double().cpu())
     normals = torch.stack([support.plane.normal.double() for support in supports])
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, float((normals @ sky).max())))))
@@ -173,13 +163,11 @@ def _check_given_table(points: Float[Tensor, "n 3"], plane: Plane) -> None:
 def check_sizes(
     points: Float[Tensor, "n 3"], labels: Tensor, pose: Float[Tensor, "4 4"], plane: Plane
 ) -> tuple[str, ...]:
-    """Refuse a depth unit that makes objects too large or small for a hand; return a note if the camera is high.
-
-    Counts of 0.25 mm read as millimetres put the camera four times too high above a table near z = 0.
-    """
+    """Refuse a depth unit that makes objects too large or small for a hand; return a note if the camera is high."""
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     sizes = sorted(float((part.amax(0) - part.amin(0)).max()) for part in parts if len(part) >= 100)
     height, above_origin = float(plane.height(pose[:3, 3])), float(plane.normal @ pose[:3, 3])
+    # Counts of 0.25 mm read as millimetres put the camera four times too high above a table near z = 0.
     scaled = plane.offset < -0.5 and any(abs(above_origin - factor * height) < 0.05 for factor in (0.25, 0.1))
     found = f"a camera {height:.3g} m above the table"
     if sizes:

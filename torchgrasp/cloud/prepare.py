@@ -53,20 +53,11 @@ class PreparedCloud(Value):
 def prepare_cloud(
     cloud: PointCloud, generator: torch.Generator, clean: bool = True, up: Float[Tensor, "3"] | None = None
 ) -> PreparedCloud:
-    """Check a cloud, and return the points and normals to which a shape is fitted.
+    """Check a cloud, and return the points and normals to which a shape is fitted: at most 2000, drawn at random.
 
-    Normals of random signs are ignored: with them a single view would look like a whole surface. If `clean`, a
-    viewpoint that too few given normals face is ignored: the cloud is then a whole surface.
-
-    Args:
-        cloud: points [m] of one or several views of one object.
-        generator: random generator that draws 2000 of the points if there are more.
-        clean: remove outliers, fit all normals anew and estimate a missing viewpoint; else fit missing normals only.
-        up: direction that points up; an estimated viewpoint is above the object.
-
-    Raises:
-        BadArgument, SuspiciousScale: see `check_cloud`; more than 16 cameras.
-        TooFewPoints: see `check_cloud`; fewer than 10 points of one camera of several.
+    Normals of random signs are ignored: with them a single view would look like a whole surface. If `clean`, outliers
+    are removed, all normals are fitted anew, and a missing viewpoint is estimated above the object, where `up` points.
+    A viewpoint that too few given normals face is then ignored: the cloud is a whole surface.
     """
     max_views, min_points = 16, 10
     cloud = remove_duplicates(cloud)
@@ -113,11 +104,7 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 
 @checked
 def clean_cloud(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without outliers, moved onto quadrics fitted around the points, with outward normals.
-
-    Outliers are those of `remove_outliers`, and points farther from their quadric than 4.5 times the median rms error.
-    Raises the errors of `check_cloud`.
-    """
+    """Return a cloud without outliers, moved onto quadrics fitted around the points, with outward normals."""
     return _fit_normals(remove_duplicates(cloud), clean=True)
 
 

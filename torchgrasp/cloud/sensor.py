@@ -128,14 +128,8 @@ def estimate_noise(
 ) -> SensorNoise | None:
     """Return the noise that a table shows: its random part as `floor` and `growth`, its smooth part as `bias`.
 
-    Args:
-        depth: image [m], 0 where nothing was measured.
-        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels].
-        table: plane in the camera's frame.
-        on_table: mask of pixels that may show the table; points over 20 mm from the plane do not count.
-
-    Returns:
-        The noise of depths; None if fewer than 1000 pixels show the table.
+    The plane is in the camera's frame. Of the pixels `on_table`, those over 20 mm from the plane do not count. The
+    noise is None if fewer than 1000 pixels show the table.
     """
     from scipy.ndimage import uniform_filter
 

@@ -33,11 +33,7 @@ def parse_npy(data: bytes) -> np.ndarray:
 
 
 def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str, np.ndarray]:
-    """Return the arrays of a .npz file by name: those with one of the given names, or all if no name is given.
-
-    Raises:
-        ValueError: no array of the `required` name, arrays that are too large unpacked, or what `parse_npy` refuses.
-    """
+    """Return the arrays of a .npz file by name, all if no `names` are given; raise `ValueError` for a bad file."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = [info for info in archive.infolist() if not names or info.filename.removesuffix(".npy") in names]
         if required and f"{required}.npy" not in [info.filename for info in members]:
@@ -71,9 +67,6 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
     """Return a text's numbers, one row for each line; blanks, commas or semicolons separate the numbers.
 
     `#` starts a comment. A first line that begins with the words x y z names the columns.
-
-    Raises:
-        ValueError: no numbers; lines of different length; a line or file that is too long or too wide.
     """
 
     def lines() -> Iterator[str]:
@@ -107,13 +100,8 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
 def read_image(name: str, path: Path | str) -> Any:
     """Return the array in an image file: .npy, .npz, .png or .tiff; also .exr for depth, or .json for masks.
 
-    Args:
-        name: name of the argument in errors. "depth" has one channel, and is the array `depth` of a .npz file. "mask"
-            may be a picture or several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
-        path: the file.
-
-    Raises:
-        BadArgument: no such file, another suffix, malformed content, depth of several channels, or no OpenEXR.
+    The argument `name` "depth" has one channel, and is the array `depth` of a .npz file. The argument "mask" may be a
+    picture or several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
     """
     masks = name == "mask"
     data, suffix = read_suffixed(name, path, (".npy", ".npz", ".png", ".tif", ".tiff", ".json" if masks else ".exr"))
@@ -144,13 +132,7 @@ def parse_json(data: bytes) -> Any:
 def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
     """Return the intrinsics in a .json, .yaml, .npy or .txt file, as `cloud_from_depth` takes them.
 
-    Args:
-        name: name of the argument in errors.
-        path: the file.
-        image: number of the image, by which BOP's scene_camera.json names its entry.
-
-    Raises:
-        BadArgument: no such file, another suffix, or malformed content.
+    `image` is the number of the image, by which BOP's scene_camera.json names its entry.
     """
     data, suffix = read_suffixed(name, path, (".json", ".yaml", ".yml", ".npy", ".txt"))
     try:

@@ -25,14 +25,9 @@ def guess_viewpoint(
     """Return a camera position [m] that explains a view, and the angle [deg] within which the camera is likely.
 
     Of all directions above the support, the one that explains the points best is taken; the camera is placed along it,
-    4 radii of the cloud away. The origin is returned instead if the points lie in front of it and a camera there can
-    have taken the view. An angle of 180 degrees means that the points hardly tell the direction.
-
-    Args:
-        points: points of a view [m], without outliers.
-        normals: unit normals of any sign.
-        up: a direction above the support; if the points show a support, its normal replaces this direction.
-        assumed: whether `up` is only a guess; then the camera may also be at the origin of the cloud's frame.
+    4 radii of the cloud away. The direction `up` is above the support; the normal of a support in the points replaces
+    it. If `up` is None or `assumed`, a guess, the camera may be at the origin, where the points lie in front of it and
+    a camera can have taken the view. An angle of 180 degrees means that the points hardly tell the direction.
     """
     rows = draw_rows(len(points), DRAWN).to(points.device)
     points, normals = points[rows], normals[rows]

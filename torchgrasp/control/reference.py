@@ -192,10 +192,7 @@ def next_target(
     lead: Float[Tensor, " h"] | float,
     period: float,
 ) -> Float[Tensor, " h"]:
-    """Return the target of the actuated joints [rad] one tick later, for given velocities [m/s] of the fingertips.
-
-    No joint's target differs from the measured joint by more than `lead` [rad].
-    """
+    """Return the target of the actuated joints [rad] one tick later, at most `lead` [rad] off the measured joints."""
     jacobian = observation.jacobian @ reference.hand.actuated.coupling
     step = law.joint_step(jacobian, velocity, period, reference.joints - target)
     joints = reference.pick(observation.joints)

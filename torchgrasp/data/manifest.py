@@ -35,21 +35,13 @@ MESHES = (".ply", ".stl", ".obj", ".off")  # suffixes of the meshes that `write_
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEntry:
-    """The description of an object in the manifest of a folder of objects.
+    """The description of an object in the manifest of a folder of objects."""
 
-    Args:
-        views: position [m] of the camera of each view by name, at scale 1.
-        scale: scale factor of mesh and clouds.
-        family: family of similar objects; the object's own name by default.
-        group: group of objects such as "solid", "thin" or "shell"; "" by default.
-        mass: mass [kg] of the real object at any scale, or None.
-    """
-
-    views: dict[str, tuple[float, ...]]
-    scale: float
-    family: str
-    group: str
-    mass: float | None
+    views: dict[str, tuple[float, ...]]  # position [m] of the camera of each view by name, at scale 1
+    scale: float  # of mesh and clouds
+    family: str  # of similar objects; the object's own name by default
+    group: str  # such as "solid", "thin" or "shell"; "" by default
+    mass: float | None  # of the real object at any scale [kg], or None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
         """Return at most `most` names of views, sorted; with `whole`, only `WHOLE`, the view that shows all sides."""
@@ -58,22 +50,13 @@ class ObjectEntry:
 
 @checked
 def read_entry(objects: Path | str, name: str) -> ObjectEntry:
-    """Return the description of an object from its folder's manifest, after a check.
-
-    Raises:
-        DatasetError: no such object, a missing field, a field of a wrong type or range, or a name that cannot be the
-            name of a folder.
-    """
+    """Return the description of an object from its folder's manifest; raise `DatasetError` for a bad or missing one."""
     return _parse_entry(name, _read_fields(objects, [name])[name])
 
 
 @checked
 def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, ObjectEntry | DatasetError]:
-    """Return for each object, sorted by name, its description from the manifest, or the error of a bad description.
-
-    Raises:
-        DatasetError: no manifest, or none of the objects in it.
-    """
+    """Return each object's description from the manifest, sorted by name, or the error of a bad description."""
     found: dict[str, ObjectEntry | DatasetError] = {}
     for name, field in sorted(_read_fields(objects, only).items()):
         try:

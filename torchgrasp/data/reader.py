@@ -83,9 +83,8 @@ class GraspShards:
         _, records = self.recent.get(j // self.size, self._read).take(j % self.size)
         grasps, g = records.grasps, i - self.starts[j]
         contacts, certificate = grasps.contacts, grasps.certificate
-        item = {
-            name: getattr(grasps, name)[g] for name in ("joints", "pregrasp", "approach", "obj_from_hand", "clearance")
-        }
+        names = ("joints", "pregrasp", "approach", "obj_from_hand", "clearance")
+        item = {name: getattr(grasps, name)[g] for name in names}
         item |= {"contacts": contacts.points[g], "normals": contacts.normals[g], "std_m": contacts.require_std()[g]}
         item |= {"margin": certificate.margin[g], "witness": certificate.witness[g]}
         item |= {"predicted": torch.sigmoid(grasps.score[g]), "simulated": records.passed[g].double().mean()}

@@ -23,12 +23,9 @@ LOCK = ".lock"  # name of the lock file in a folder. It holds the process and ho
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
-    """Write text (as UTF-8), bytes, or the output of a function to a file atomically; return its path.
+    """Write text (as UTF-8), bytes, or what a function writes to a file object, atomically; return the path.
 
-    The function gets a file object. A missing folder is created.
-
-    Raises:
-        OutputError: the folder cannot be written, or the disk is full. Nothing half-written is left.
+    A missing folder is created. `OutputError` is raised if the folder cannot be written, or the disk is full.
     """
     path, data = Path(path), content.encode() if isinstance(content, str) else content
     if not isinstance(data, bytes):
@@ -130,11 +127,7 @@ def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Create a folder and lock it against other runs within the context; remove half-written files of an earlier run.
-
-    Raises:
-        OutputError: another run holds the lock, or the folder cannot be written.
-    """
+    """Create and lock a folder within the context; remove half-written files. A folder in use raises `OutputError`."""
     with _hold("folder", folder, folder / LOCK):
         _remove_parts(folder.rglob(f".*{ENDING}"))
         yield
@@ -142,10 +135,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[None]:
-    """Lock a file against other runs within the context, by a lock file beside it.
-
-    On entry, remove the half-written copies of the file that broken-off runs left.
-    """
+    """Lock a file within the context by a lock file beside it; remove half-written copies of broken-off runs."""
     with _hold("path", path, path.with_name(f".{path.name}{LOCK}")):
         _remove_parts(x for x in path.parent.glob(f".*{ENDING}") if x.name.startswith(f".{path.name}."))
         yield

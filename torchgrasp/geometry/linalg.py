@@ -92,15 +92,10 @@ def farthest_points(
     distance: Callable[[Tensor, Tensor], Tensor] | None = None,
     before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points, each the farthest from the points before it.
+    """Return the indices of at most `count` points, each the farthest from the points before it, from `first` on.
 
-    Args:
-        points: vectors, or any values that `distance` compares.
-        count: the number of points.
-        first: index of the first point.
-        tie: relative difference up to which distances count as equal. The first of equally far points is taken.
-        distance: function that returns the distance of each point from a single point; Euclidean by default.
-        before: points that count as already picked and are not returned; `first` is then not used.
+    Distances whose relative difference is at most `tie` are equal: the first of equally far points is taken. Points in
+    `before` count as already picked and are not returned; `first` is then not used. `distance` is Euclidean by default.
     """
     every = points.detach().cpu()
     x = np.ascontiguousarray(every.numpy().T)  # NumPy is an order of magnitude faster than torch for few points

@@ -136,11 +136,7 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Return what `trimesh.load_mesh` reads from the bytes of a file; a malformed file may raise any exception.
-
-    Raises:
-        ValueError: the file has more than `MESH_FACES` faces, or a .ply header too long or with too many properties.
-    """
+    """Return what `trimesh.load_mesh` reads from bytes; bad bytes and too many faces may raise any exception."""
     import trimesh
 
     data = _geometry(data) if suffix == ".obj" else data

@@ -100,19 +100,14 @@ class LinearResiduals(Linearisation):
 
 @dataclasses.dataclass(frozen=True)
 class LeastSquares(Problem[State, LinearResiduals]):
-    """A batch of least-squares problems: the cost is the sum of squared residuals.
+    """A batch of least-squares problems: the cost is the sum of squared residuals."""
 
-    Args:
-        residuals: function that returns residuals and Jacobian of the problems with given indices, at their states.
-        moved: function that returns the states after given steps.
-        solved: sum of squared residuals below which a problem is solved.
-        largest: largest change of a variable in one step.
-    """
-
-    residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
-    moved: Callable[[State, Float[Tensor, "a d"]], State]
-    solved: float = SOLVED
-    largest: float = 0.3
+    residuals: Callable[
+        [State, Int[Tensor, "a"]], Residuals
+    ]  # residuals and Jacobian of the problems with given indices
+    moved: Callable[[State, Float[Tensor, "a d"]], State]  # the states after given steps
+    solved: float = SOLVED  # sum of squared residuals below which a problem is solved
+    largest: float = 0.3  # largest change of a variable in one step
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
         """Return the residuals, their Jacobian and the sum of squared residuals of each problem."""
@@ -120,10 +115,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Damping) -> Steps:
-        """Return the damped step of each problem, and whether the problem goes on.
-
-        A step changes no variable by more than `largest`. It is zero if the matrix of the problem is singular.
-        """
+        """Return the damped step of each problem, zero if its matrix is singular, and whether the problem goes on."""
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.

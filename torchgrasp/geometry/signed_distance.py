@@ -81,10 +81,7 @@ def field_from_surface(
 ) -> SignedDistanceField:
     """Return the signed distance field of a triangle mesh [m] with outward faces; the mesh may be open.
 
-    The nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh.
-
-    Raises:
-        BadArgument: wrong shapes, faces that name no vertex or have no area, or a grid of more than 2e7 nodes.
+    The nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh: at most 2e7 nodes.
     """
     check_tensor("vertices", vertices, (None, 3))
     surface = _Surface(vertices, faces)

@@ -26,17 +26,11 @@ SUPPORT = "a plane with objects on it and nothing seen through it, or a table th
 
 @dataclasses.dataclass(frozen=True)
 class Support:
-    """A plane that objects stand on, and its region: the convex hull of the points on it.
+    """A plane that objects stand on, and its region: the convex hull of the points on it."""
 
-    Args:
-        plane: the plane; the camera is above it.
-        sides: outward unit vector and offset [m] of each vertical side of the region; None if it is unbounded.
-        width: smaller width of the region [m].
-    """
-
-    plane: Plane
-    sides: Float[Tensor, "s 4"] | None = None
-    width: float = math.inf
+    plane: Plane  # the camera is above it
+    sides: Float[Tensor, "s 4"] | None = None  # outward unit vector and offset [m] of each; None: unbounded
+    width: float = math.inf  # smaller width of the region [m]
 
     def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
         """Return which points lie over the region or at most `margin` [m] beside it; a negative margin shrinks it."""
@@ -97,18 +91,9 @@ def find_supports(
     Triples of points propose planes. An iterated fit with Tukey's weights refines each plane. Objects stand on a
     support, over its region, and the camera sees nothing through the region. The support with the most points low above
     it comes first; the points count twice if the camera looks at the support. Of parallel supports, a higher one as
-    wide as furniture comes first. A rigid motion of all arguments moves the supports alike.
-
-    Args:
-        points: everything that was seen [m].
-        viewpoint: the camera's position [m], on the upper side. If it is None, the side with more points is upper.
-        up: vector against gravity, of any length; None allows any direction.
-        seed: random seed of the draws.
-        least_width: least width of the region of a support [m].
-
-    Raises:
-        BadArgument: a wrong shape or type, or points that are not finite.
-        NoSupport: no plane holds enough points; nothing stands on it; the camera sees through it, or is below it.
+    wide as furniture comes first. A rigid motion of all arguments moves the supports alike. Without a camera, the side
+    with more points is the upper one. Without `up`, any direction is allowed. `NoSupport` is raised if there is no
+    support.
     """
     points = check_tensor("points", points, (None, 3)).detach().cpu().double()
     eye = None if viewpoint is None else check_tensor("viewpoint", viewpoint, (3,)).detach().cpu().double()
@@ -193,10 +178,7 @@ class Hull:
 
 
 def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
-    """Yield the connected groups of points in a plane, the largest first, down to a fiftieth of the largest.
-
-    Points in adjacent cells of 3 cm are connected, also over small gaps. Narrow strips of cells are dropped.
-    """
+    """Yield the connected groups of points in a plane, the largest first, without narrow strips and specks."""
     from scipy.ndimage import binary_closing, binary_opening, label
 
     cells = torch.floor(flat / 0.03).long()

@@ -118,9 +118,7 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
         center=real(center),
         half=real(half),
         radius=real(radius),
-        pairs=torch.tensor([x for kind in kinds for pair in kind for x in pair], dtype=torch.long, device="cpu").view(
-            -1, 2
-        ),
+        pairs=torch.tensor([*kinds[0], *kinds[1], *kinds[2]], dtype=torch.long, device="cpu").view(-1, 2),
         kinds=(len(kinds[0]), len(kinds[1]), len(kinds[2])),
     )
 
@@ -140,12 +138,7 @@ def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, flo
 
 
 def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
-    """Return the pairs of links that collide in some of n random postures but not in nearly all, without neighbours.
-
-    Raises:
-        BadArgument: n outside [1, 10^7]; a coupling with joints that the URDF lacks.
-        HandFileError: so many shapes close together that the test would take too long.
-    """
+    """Return the pairs of links that collide in some of n random postures but not in nearly all, without neighbours."""
     check_whole("n", n, 1, 10**7)
     tree, shapes = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
     if not len(shapes.pairs):

@@ -179,10 +179,7 @@ def chain_from_urdf(urdf: Urdf) -> "Chain":
 
 
 def tree_from_urdf(urdf: Urdf, chain: Any = None, ends: Collection[str] | None = None) -> KinematicTree:
-    """Return the kinematic tree of a URDF's chain, or the part of it that leads to the links `ends`.
-
-    Axes, offsets, types and parents are the chain's; links and joints are in the order of the URDF.
-    """
+    """Return the kinematic tree of a URDF's chain, or the part of it to the links `ends`, in the order of the URDF."""
     model: Any = chain or chain_from_urdf(urdf)  # it declares no types
     index, paths = model.frame_to_idx, [path.tolist() for path in model.parents_indices]
     part = {k for name in (index if ends is None else (urdf.root, *ends)) for k in paths[index[name]]}

@@ -116,10 +116,8 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
         if right:
             clean.set(key, " ".join("0" if float(w) == 0 else w for w in words))  # no negative zero
         elif text != "" or key in element.attrib:
-            found = f"{where} {key} {(text or 'nothing')[:80]!r}"
-            raise HandFileError(
-                "urdf", f"{path}: {found}", f"{count} finite numbers" if count > 1 else "a finite number"
-            )
+            allowed = f"{count} finite numbers" if count > 1 else "a finite number"
+            raise HandFileError("urdf", f"{path}: {where} {key} {(text or 'nothing')[:80]!r}", allowed)
     if tag == "geometry" and (len(element) != 1 or element[0].tag not in SIZES):
         found = f"{where} <{element[0].tag}>" if len(element) == 1 else f"{where} without one shape"
         raise HandFileError("urdf", f"{path}: {found}", "box, cylinder or sphere")

@@ -128,11 +128,7 @@ class Urdf:
 
 @checked
 def read_urdf(path: Path | str) -> Urdf:
-    """Read a URDF file, and check that the library can use it.
-
-    Raises:
-        HandFileError: see `read_published`; a mesh as a shape, a joint without limits, or a chain of couplings.
-    """
+    """Read a URDF that the library can use as it is: without meshes, endless joints and chains of coupled joints."""
     urdf = read_published(path)
     for link in urdf.links:
         if any(shape.kind == "mesh" for shape in link.shapes):
@@ -146,11 +142,7 @@ def read_urdf(path: Path | str) -> Urdf:
 
 
 def read_published(path: Path | str) -> Urdf:
-    """Read a URDF as its maker published it: meshes, joints without limits and chains of coupled joints are allowed.
-
-    Raises:
-        HandFileError: the file is missing, too large, hostile or not a tree of links.
-    """
+    """Read a URDF as its maker published it: meshes, joints without limits and chains of coupled joints are allowed."""
     path = Path(path)
     return _parse(path, read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf")))
 
@@ -257,14 +249,11 @@ def _check_joints(urdf: Urdf) -> None:
             raise urdf.wrong(f"joint {j.name} with limits {j.lower}, {j.upper}", "limits with lower < upper")
         passed = [j.name]
         while mimic := movable[passed[-1]].mimic:
+            follower = f"joint {passed[-1]} that follows"
             if mimic.source not in movable:
-                raise urdf.wrong(
-                    f"joint {passed[-1]} that follows {mimic.source!r}", "a movable joint of the file to follow"
-                )
+                raise urdf.wrong(f"{follower} {mimic.source!r}", "a movable joint of the file to follow")
             if mimic.source in passed:
-                raise urdf.wrong(
-                    f"joint {passed[-1]} that follows coupled joints in a circle", "an independent joint to follow"
-                )
+                raise urdf.wrong(f"{follower} coupled joints in a circle", "an independent joint to follow")
             passed.append(mimic.source)
 
 

@@ -163,10 +163,7 @@ class CobylaRun:
         self.last: tuple[bytes, float, np.ndarray] | None = None
 
     def place(self, x: np.ndarray) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
-        """Return joints, link frames and hand pose at COBYLA's variables `x`, and whether the pose exists.
-
-        The pose follows from Eq. (24) of the paper; it does not exist if the fingertips are on a line.
-        """
+        """Return joints, link frames and hand pose, Eq. (24), at COBYLA's `x`, and whether the tips span a frame."""
         step = ANGLE * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
         joints = (self.first + step).clamp(self.hand.lower.to(step), self.hand.upper.to(step))
         frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())

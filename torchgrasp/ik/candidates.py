@@ -78,15 +78,12 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Hand configurations to check, with contacts, force closure certificates, and the `status` of contact planning.
-
-    Finger i touches contact `permutation[:, i]` of the planned contact set. `contacts` are in the order of the fingers.
-    """
+    """Hand configurations to check, with contacts, force closure certificates, and the `status` of contact planning."""
 
     configuration: Annotated[Configuration, Rows("g")]
-    contacts: Annotated[Contacts, Rows("g")]
+    contacts: Annotated[Contacts, Rows("g")]  # in the order of the fingers
     certificate: Annotated[Certificate, Rows("g")]
-    permutation: Int[Tensor, "g f"]
+    permutation: Int[Tensor, "g f"]  # finger i touches contact `permutation[:, i]` of the planned set
     status: Int[Tensor, "g"]
 
 
@@ -156,10 +153,7 @@ def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) ->
 def check_candidates(
     problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
 ) -> Grasps:
-    """Check candidates by `measure_errors`, and return one grasp for each, with the `Status` of the first failed check.
-
-    A grasp without errors also gets a pre-grasp and an approach direction.
-    """
+    """Check candidates by `measure_errors`, opening and approach; return a grasp with the first fault for each."""
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed

@@ -172,9 +172,7 @@ def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: boo
         found.append(coarse)
     if world.plane is not None:
         height = along(centres, world.plane) - radius - world.plane.offset
-        found.append(
-            height + CLEARANCE * spheres.touching if tips_touch else height
-        )  # contacts decide how low tips are
+        found.append(height + CLEARANCE * spheres.touching if tips_touch else height)  # contacts tell how low tips are
     if not found:
         return []
     coarse, index = torch.stack(found, 1).topk(min(HINGES, len(radius)), dim=2, largest=False, sorted=False)

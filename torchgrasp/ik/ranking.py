@@ -185,10 +185,7 @@ def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"]) -> Grasps:
 
 
 def by_success(grasps: Grasps) -> Grasps:
-    """Sort grasps: executable grasps with a supported prediction, other executable grasps, then failed grasps.
-
-    Each of the three groups is sorted by falling score.
-    """
+    """Sort grasps, each group by falling score: executable with a supported prediction, other executable, failed."""
     late = 2 * (grasps.status != Status.OK).int()
     late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()
     return grasps[lexical_order(late, -grasps.score)]

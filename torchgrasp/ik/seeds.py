@@ -201,12 +201,9 @@ def query_mixture(
 
     An assignment of contacts to fingers is reachable if its energy (Eq. 21) is below `max_energy`. Each reachable
     assignment gives `n_seeds` seeds: the mean joints given the contacts (Eq. 23), and the mean joints of the most
-    responsible components. The seeds of a contact set are sorted: seeds that touch the surface from outside come
-    first, then by tip error. A contact set without a reachable assignment has no seeds.
-
-    Raises:
-        BadArgument: the mixture is of another hand, or of other joint limits or fingertips; a number is out of range,
-            or contacts are malformed.
+    responsible components. The seeds of a contact set are sorted: seeds that touch the surface from outside come first,
+    then by tip error. A contact set without a reachable assignment has no seeds. A model of another hand, joint limits
+    or fingertips is a `BadArgument`.
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)

@@ -213,10 +213,7 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
 
 
 def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: Guess) -> Bool[Tensor, "b"]:
-    """Return which sets of four or five contacts have force closure.
-
-    The cones get more edges until each verdict is proven.
-    """
+    """Return which sets of four or five contacts have force closure; cones get edges until each verdict is proven."""
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches
         return closed

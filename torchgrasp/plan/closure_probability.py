@@ -34,23 +34,14 @@ OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 
 
 @dataclasses.dataclass(frozen=True)
 class LinePosterior(Batch):
-    """The joint Gaussian of signed distance d and its gradient w along the lines x + t n through the contacts.
+    """The joint Gaussian of signed distance d and its gradient w along the lines x + t n through the contacts."""
 
-    Args:
-        points: planned contacts x, in normalised units.
-        normals: outward unit normals n.
-        deviation: standard deviation of the surface at each contact; t of nodes and grid points is a multiple of it.
-        distance: mean of d at the 23 grid points of each line, from outside to inside.
-        slope: mean of w at the five nodes of each line.
-        root: symmetric root of the covariance of the z = 20 f values (d, w) at all nodes, line by line, node by node.
-    """
-
-    points: Vectors
-    normals: Vectors
-    deviation: Float[Tensor, "b f"]
-    distance: Float[Tensor, "b f 23"]
-    slope: Float[Tensor, "b f 5 3"]
-    root: Float[Tensor, "b z z"]
+    points: Vectors  # planned contacts x, in normalised units
+    normals: Vectors  # outward unit normals n
+    deviation: Float[Tensor, "b f"]  # of the surface at each contact; t of nodes and grid points is a multiple of it
+    distance: Float[Tensor, "b f 23"]  # mean of d at the grid points of each line, from outside to inside
+    slope: Float[Tensor, "b f 5 3"]  # mean of w at the five nodes of each line
+    root: Float[Tensor, "b z z"]  # of the covariance of the z = 20 f values (d, w) at all nodes, by line, then by node
 
 
 @functools.cache

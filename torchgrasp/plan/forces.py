@@ -41,10 +41,7 @@ Slide = Float[Tensor, "b f 3 k"]
 
 
 def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
-    """Return the grasp matrix, which maps contact forces at f `points` to total force and torque about their centroid.
-
-    The n = 3 f columns belong to the force components, point by point.
-    """
+    """Return the grasp matrix: it maps the forces at f points to total force and torque about their centroid."""
     arms = points - points.mean(-2, keepdim=True)
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
     return torch.cat([torch.cat([eye] * arms.shape[-2], -1), torch.cat(skew(arms).unbind(-3), -1)], -2)

@@ -60,15 +60,12 @@ class State(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """The linearised constraints: weighted residuals, their weights, and the Jacobian without weights.
-
-    `inside` says whether all points are in the domain.
-    """
+    """The linearised constraints: weighted residuals, their weights, and the Jacobian without weights."""
 
     residual: Float[Tensor, "a r"]
     weight: Float[Tensor, "a r"]
     jacobian: Float[Tensor, "a r u"]
-    inside: Bool[Tensor, "a"]
+    inside: Bool[Tensor, "a"]  # whether all points are in the domain
 
     @property
     def weighted_jacobian(self) -> Float[Tensor, "a r u"]:

@@ -53,13 +53,10 @@ def chunk_sizes(starts: int) -> list[int]:
 
 
 class Settled(NamedTuple):
-    """A specification with a known `flat_radius`, and p candidate contacts on flat surface, with their normals.
-
-    `candidates` is None if the specification does not ask for flatness.
-    """
+    """A specification with a known `flat_radius`, and p candidate contacts on flat surface, with their normals."""
 
     spec: ContactSpec
-    candidates: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]] | None
+    candidates: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]] | None  # None: not asked for
 
 
 def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:

@@ -91,9 +91,8 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
         theirs = torch.tensor([float(x) for x in meta["hand_codes"].split()], dtype=torch.float64, device="cpu")
     except ValueError as error:
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
-    if theirs.shape != ours.shape or not torch.allclose(
-        theirs.to(ours), ours, rtol=0, atol=1e-5
-    ):  # seven digits were written
+    same = theirs.shape == ours.shape and torch.allclose(theirs.to(ours), ours, rtol=0, atol=1e-5)
+    if not same:  # to the seven digits that were written
         whose = f"hand {meta.get('hand')!r}, fingers {meta.get('fingers')!r}, of other limits or fingertips"
         allowed = f"one of {hand.name!r}, {hand.source.option!r}: train it anew"
         raise BadArgument("mixture", f"a model of {whose}", allowed)

@@ -20,26 +20,16 @@ COMPARED_MODES = 4  # modes of which the nearest is compared: a code has a few p
 
 @dataclasses.dataclass(frozen=True)
 class MixtureScore(Value):
-    """Errors with which a learned model predicts the joints of held-out postures from their codes.
-
-    Args:
-        joint_names: names of the joints.
-        error: mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23).
-        deviation: standard deviation of the absolute error over the postures [rad].
-        nearest_mode: mean absolute error [rad] of the best of the `COMPARED_MODES` likeliest `GraspMixture.modes`.
-        paper_coverage, default_coverage: fractions of codes of energy below `PAPER_ENERGY` and `DEFAULT_ENERGY`.
-        log_likelihood: mean log-likelihood of a posture [nats].
-        postures: number of postures.
-    """
+    """Errors with which a learned model predicts the joints of held-out postures from their codes."""
 
     joint_names: tuple[str, ...]
-    error: Float[Tensor, "h"]
-    deviation: Float[Tensor, "h"]
-    nearest_mode: float
-    paper_coverage: float
-    default_coverage: float
-    log_likelihood: float
-    postures: int
+    error: Float[Tensor, "h"]  # mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23)
+    deviation: Float[Tensor, "h"]  # standard deviation of the absolute error over the postures [rad]
+    nearest_mode: float  # mean absolute error [rad] of the best of the `COMPARED_MODES` likeliest modes
+    paper_coverage: float  # share of codes of energy below `PAPER_ENERGY`
+    default_coverage: float  # share of codes of energy below `DEFAULT_ENERGY`
+    log_likelihood: float  # mean over the postures [nats]
+    postures: int  # their number
 
     @property
     def mean_error(self) -> float:
@@ -119,14 +109,8 @@ def bic_curve(
     """Fit a mixture for each number of components, and return the BIC of each (Fig. 6 b, d); raises as `fit_mixture`.
 
     Codes of "uniform" samples are exact functions of the joints, so the BIC falls without end. For "grasping" samples,
-    whose fingertips roll, the BIC has a minimum.
-
-    Args:
-        samples: postures to fit.
-        components: numbers of components to try.
-        checkpoints: folder for the checkpoints of all fits; an interrupted call continues from them.
-        observer: called after each fit with its number of components and its mixture.
-        fit: more arguments of `fit_mixture`: seed, iterations, tolerance and regularisation.
+    whose fingertips roll, the BIC has a minimum. `checkpoints` is a folder from which an interrupted call continues.
+    `fit` holds more arguments of `fit_mixture`.
     """
     if not components:
         raise BadArgument("components", "none", "at least one number")

@@ -12,12 +12,7 @@ REACH = 0.012  # distance [m] on either side of a crease over which its angle is
 
 
 def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """Cut each piece along its concave creases, and return an image of each pixel's part number, 0 for none.
-
-    Args:
-        image: the depth image in which the pieces were found.
-        pieces: number of the piece of each pixel, 0 for none.
-    """
+    """Cut each piece along its concave creases, and return an image of each pixel's part number, 0 for none."""
     from scipy.ndimage import find_objects
 
     least = 300 * pieces.numel() / (640 * 480)  # pixels of the smallest part

@@ -36,9 +36,8 @@ def read_scene(path: Path | str) -> Scene:
     table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
     others, bounded = arrays.pop("others", np.empty((0, 4))), bool(arrays.pop("bounded", True))
     given = arrays.pop("given", [] if table is not None and "labels" in arrays else None)
-    plane, *rest = (
-        (Plane(torch.tensor(row[:3]), float(row[3])) for row in [table, *others]) if table is not None else [None]
-    )
+    rows = [] if table is None else [table, *others]
+    plane, *rest = [Plane(torch.tensor(row[:3]), float(row[3])) for row in rows] or [None]
     scene = Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
     own = scene.given if given is None else tuple(label for label in scene.things if label in given)
     image = dataclasses.replace(scene.image, bounded=bounded)

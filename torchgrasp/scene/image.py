@@ -30,13 +30,10 @@ LEAST_PIXELS = 30  # fewest pixels of an object: fewer do not show its shape
 @checked
 @dataclasses.dataclass(frozen=True)
 class DepthImage(Value):
-    """A pinhole camera's depth image: `depth` [m] along the optical axis, 0 where nothing was measured.
+    """A pinhole camera's depth image."""
 
-    `intrinsics` [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] are in pixels. `obj_from_camera` is the camera's pose.
-    """
-
-    depth: Float[Tensor, "h w"]
-    intrinsics: Float[Tensor, "3 3"]
+    depth: Float[Tensor, "h w"]  # along the optical axis [m], 0 where nothing was measured
+    intrinsics: Float[Tensor, "3 3"]  # [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels
     obj_from_camera: Pose
     bounded: bool = True  # whether its border is the camera's; an image made of a cloud has none
 
@@ -138,11 +135,7 @@ def image_of_cloud(
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays in a scene's .npz file by name, converted to the types and shapes that a scene needs.
-
-    Raises:
-        CloudFileError: no such file, or malformed content.
-    """
+    """Return the arrays in a scene's .npz file by name, converted to the types and shapes that a scene needs."""
     typed = {
         "table": (float, 4),
         "others": (float, (-1, 4)),

@@ -22,30 +22,18 @@ MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a 
 def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> Int[Tensor, "..."]:
     """Return checked labels of the depth's or the cloud's shape: whole numbers >= 0, where 0 means no object.
 
-    Args:
-        labels: numbers of any type in the given shape, or with one more axis of length 1; a picture (h, w, 3 or 4) with
-            a colour for each object, where black and transparent mean no object; a list of masks, where a smaller mask
-            lies above a larger one; a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its
-            "segmentation"; or a dict with a list of "annotations".
-        shape: shape of the depth (h, w), or of the cloud (n,).
-        name: name of the argument, for errors.
-
-    Raises:
-        BadArgument: another shape, negative or broken numbers, run lengths of another size, or over 1000 values.
-
-    >>> read_labels({"size": [2, 3], "counts": [1, 2, 3]}, (2, 3))
-    tensor([[0, 1, 0],
-            [1, 0, 0]])
+    The labels are numbers of any type in the given shape, or with one more axis of length 1; a picture (h, w, 3 or 4)
+    with a colour for each object, where black and transparent mean no object; a list of masks, where a smaller mask
+    lies above a larger one; a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its
+    "segmentation"; or a dict with a list of "annotations".
     """
     if isinstance(labels, Mapping) and "annotations" in labels:
         labels = labels["annotations"]
     masks = _masks(labels, shape)
     if masks is None:
         read = _read_one(labels, shape, name)
-        if len(read.unique()) > MOST_LABELS + 1:
-            raise BadArgument(
-                name, f"{len(read.unique())} values, as of a photograph", f"at most {MOST_LABELS} objects"
-            )
+        if (count := len(read.unique())) > MOST_LABELS + 1:
+            raise BadArgument(name, f"{count} values, as of a photograph", f"at most {MOST_LABELS} objects")
         return read
     if len(masks) > MOST_LABELS:
         raise BadArgument(name, f"{len(masks)} masks", f"at most {MOST_LABELS}")
@@ -96,11 +84,7 @@ def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..
 
 
 def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
-    """Return the boolean mask of one object, given in any form that `read_labels` takes.
-
-    Raises:
-        BadArgument: see `read_labels`; no pixel inside; several objects.
-    """
+    """Return the boolean mask of one object, in any form that `read_labels` takes; refuse none and several objects."""
     labels = read_labels(mask, shape, "mask")
     found = labels[labels > 0].unique()
     if not len(found):
@@ -150,10 +134,7 @@ def label_image(
 
     Given labels lose pixels on the table and flying pixels. A mask becomes label 1, and loses strips of neighbouring
     objects, too. Pixels of the mask's object just outside of the mask get label 0. A note tells of each mask that loses
-    a twentieth of its pixels or more.
-
-    Raises:
-        BadArgument: nothing but the table is left of a mask, or nothing of all labels.
+    a twentieth of its pixels or more. A mask that loses nearly all is a `BadArgument`.
     """
     if labels is not None:
         kept = torch.where(on_surface(image, support.plane), labels, 0)

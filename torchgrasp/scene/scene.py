@@ -226,9 +226,8 @@ class Scene(Value):
             if int((sizes > 0.1 * sizes.sum()).sum()) > 1:
                 found.append(f"object {k} has a crease: if it is several objects, give a mask of the one to grasp")
         if self.image.at_border(self.pixels[self.rows_of()]):
-            found.append(
-                "the target is cut off at the border of the image: its other part is unknown; turn the camera to it"
-            )
+            fix = "its other part is unknown; turn the camera to it"
+            found.append(f"the target is cut off at the border of the image: {fix}")
         return tuple(found)
 
     @property

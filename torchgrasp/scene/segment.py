@@ -25,11 +25,8 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     """Return the label of each pixel: 1, 2, ... for objects, the largest first, and 0 for all other pixels.
 
     A piece is a connected component of the pixels above the table, without a jump of depth and without a crease. Pieces
-    of one object are merged. Pixels at jumps go to the object whose surface they lie on, if there is one.
-
-    Args:
-        image: one view of the scene.
-        support: the plane that the objects stand on, in the frame of the image; pixels beside its region get 0.
+    of one object are merged. Pixels at jumps go to the object whose surface they lie on, if there is one. Pixels beside
+    the region of the support get 0.
     """
     table, points = support.plane, image.points()
     measured, smooth = image.depth > 0, image.without_speckle()
@@ -165,14 +162,9 @@ def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
 
 
 def _is_noise(labels: Int[Tensor, "h w"], k: int, points: Tensor, pixel: Tensor, deviations: Tensor) -> bool:
-    """Return whether a small object is an uneven place of the table, or a fringe of a body ten times as large.
+    """Return whether the small object k is an uneven place of the table, or a fringe of a body ten times as large.
 
-    Args:
-        labels: labels of the objects.
-        k: label of the small object.
-        points: the point of each pixel [m], (h, w, 3).
-        pixel: the width of each pixel on its surface [m], (h, w).
-        deviations: height of each pixel above the table, over the standard deviation of the noise, (h, w).
+    `pixel` is the width of each pixel on its surface [m]. `deviations` are heights above the table over the noise's.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt
 

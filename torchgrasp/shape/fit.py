@@ -100,9 +100,7 @@ def fit_shape(
     tensor(True)
     """
     if isinstance(kernel, Kernel) and not is_plain(kernel.profile(cloud.points.new_zeros(()))):
-        raise BadArgument(
-            "kernel", "a profile with tensors that require a gradient", "numbers: use `condition` instead"
-        )
+        raise BadArgument("kernel", "a profile with tensors that require a gradient", "numbers: use `condition`")
     plane, cloud = as_plane(table), remove_duplicates(cloud)
     frame = upright_frame(cloud.points, cloud.viewpoint, plane)
     options = FitOptions(noise, budget, psi_scale, support, kernel, criterion)
@@ -126,9 +124,8 @@ def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitO
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
     if len(cloud) < FEW_POINTS:
-        _warn(
-            FewPoints, f"{len(cloud)} points, where a shape needs {FEW_POINTS}: the shape is a guess; give more points"
-        )
+        few = f"{len(cloud)} points, where a shape needs {FEW_POINTS}"
+        _warn(FewPoints, f"{few}: the shape is a guess; give more points")
     elif is_flat(cloud.points):
         _warn(Flat, "the points lie in one plane, to their noise: the thickness is a guess; give a view of two sides")
     generator, noise = torch.Generator("cpu").manual_seed(seed), options.noise
@@ -222,9 +219,8 @@ def condition(
     """
     for name in ("x", "has_normal"):
         if not is_known(getattr(observations, name)):
-            raise BadArgument(
-                f"observations.{name}", "a tensor inside torch.vmap", "the same for all that vmap maps over"
-            )
+            allowed = "the same for all that vmap maps over"
+            raise BadArgument(f"observations.{name}", "a tensor inside torch.vmap", allowed)
     observations = observations.to(normalisation.center.device, torch.float64)
     psi = psi_scale * longest_distance(observations.x)
     kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel

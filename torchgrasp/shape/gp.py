@@ -155,10 +155,8 @@ class ShapeGP(Posterior, Normalisation):
 
         Raises the errors of `predict`.
         """
-        joint = self.joint(points.double())
-        root = symmetric_root(
-            joint.covariance, float(self.prior_block()[0, 0].detach()), "query points within the domain"
-        )
+        joint, prior = self.joint(points.double()), float(self.prior_block()[0, 0].detach())
+        root = symmetric_root(joint.covariance, prior, "query points within the domain")
         generator = torch.Generator("cpu").manual_seed(seed)
         with torch._C._DisableFuncTorch():  # the draws are the same for all that torch.vmap maps over
             draws = torch.randn(n, len(root), dtype=torch.float64, device="cpu", generator=generator).to(self.device)

@@ -20,19 +20,13 @@ class Posterior(Value):
 
     (d, w) are the signed distance and its gradient. All methods are differentiable, to any order, in the points and in
     the tensors of the posterior. Plain tensors take faster formulas, which reuse buffers.
-
-    Args:
-        x: observed points, those with normals first.
-        weights: (K + noise)^-1 y for the observed numbers y: first all distances, then the normals by component.
-        factor: lower Cholesky factor of K + noise. Rows of later observations come last, unlike in `x`.
-        order: for each row of `factor`, its row in `weights`; None if the order is the same.
     """
 
-    x: Float[Tensor, "n 3"]
+    x: Float[Tensor, "n 3"]  # observed points, those with normals first
     has_normal: Bool[Tensor, "n"]
-    weights: Float[Tensor, "rows"]
-    factor: Float[Tensor, "rows rows"]
-    order: Int[Tensor, "rows"] | None
+    weights: Float[Tensor, "rows"]  # (K + noise)^-1 y of the observed y: all distances, then the normals by component
+    factor: Float[Tensor, "rows rows"]  # lower Cholesky factor of K + noise; rows of later observations come last
+    order: Int[Tensor, "rows"] | None  # row in `weights` of each row of `factor`; None if the same
     kernel: Kernel
 
     @cached_property
@@ -211,9 +205,8 @@ def _mean_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[tuple[Tens
     outer[:, :near].addcmul_(third[:, :near], along, value=-1.0)
     distance = torch.mv(k, a) - (near_first * along).sum(1)
     gradient = _sum_differences(c, x, known) - near_first @ b
-    half = torch.stack(
-        [0.5 * _sum_differences(outer * d[m], x, known) - (near_second * d[m][:, :near]) @ b for m in range(3)], 1
-    )
+    rows = [0.5 * _sum_differences(outer * part, x, known) - (near_second * part[:, :near]) @ b for part in d]
+    half = torch.stack(rows, 1)
     hessian = half + half.mT
     hessian.diagonal(dim1=1, dim2=2).add_(c.sum(1, keepdim=True))
     return (distance, gradient, hessian), (d, k, first, near_second)

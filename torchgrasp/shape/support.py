@@ -41,27 +41,16 @@ FreeSpace = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 
 @dataclasses.dataclass(frozen=True)
 class Support(Value):
-    """The normalised frame of a surface, and the observations besides the cloud.
-
-    Args:
-        frame: normalised frame.
-        anchors: observed distances at points inside and outside the object, without normals.
-        normal_noise: standard deviation of the cloud's normals.
-        std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
-        parts: observed points of the outline and of the hidden side.
-        free: points in free space, or None if they are not used.
-        rows: mask of the cloud's points that lie on this surface; None means all points.
-        kind: how the hidden side was completed, as in `ShapeGP`.
-    """
+    """The normalised frame of a surface, and the observations besides the cloud."""
 
     frame: Normalisation
-    anchors: Observations
-    normal_noise: float
-    std_factor: float = 1.0
-    parts: tuple[Part, ...] = ()
-    free: FreeSpace | None = None
-    rows: Bool[Tensor, "rows"] | None = None
-    kind: Kind = "guess"
+    anchors: Observations  # observed distances at points inside and outside the object, without normals
+    normal_noise: float  # standard deviation of the cloud's normals
+    std_factor: float = 1.0  # ratio of the surface's true deviations to the posterior's standard deviations
+    parts: tuple[Part, ...] = ()  # observed points of the outline and of the hidden side
+    free: FreeSpace | None = None  # points in free space, or None if they are not used
+    rows: Bool[Tensor, "rows"] | None = None  # mask of the cloud's points on this surface; None means all
+    kind: Kind = "guess"  # how the hidden side was completed, as in `ShapeGP`
 
 
 def paper_support(seen: PreparedCloud, noise: float, generator: torch.Generator) -> Support:
@@ -156,13 +145,8 @@ def vessel_supports(
     surface = torch.cat([cloud.points[inner.seen], inner.hidden.points])
     bottom = float(surface[:, 2].min())
     over = vessel.rim + 0.5 * vessel.radius  # there the inner surface still surrounds free space: it has no lid
-    inside = (
-        axis
-        + torch.tensor([0.5 * (bottom + vessel.rim), vessel.rim, over], dtype=torch.float32, device="cpu").double()[
-            :, None
-        ]
-        * up
-    )
+    heights = torch.tensor([0.5 * (bottom + vessel.rim), vessel.rim, over], dtype=torch.float32, device="cpu").double()
+    inside = axis + heights[:, None] * up
     around = sphere[sphere[:, 2] < vessel.rim]
     clear = torch.cat([torch.cdist(inside, surface).amin(1), -torch.cdist(around, surface).amin(1)])
     space = anchors(torch.cat([inside, around]), clear)
@@ -181,10 +165,7 @@ def vessel_supports(
 
 
 def _middle(cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: Normalisation) -> Middle:
-    """Return points in the middle of the vessel's wall, without handles and rim.
-
-    Points on its outer and inner surface, seen or estimated, are moved into the material by half the thickness.
-    """
+    """Return points in the middle of a vessel's wall, half its thickness off the surfaces, without the rim."""
     assert cloud.normals is not None
     points, normals = [], []
     for wall, seen in zip(walls, (vessel.body & ~vessel.inner, vessel.inner), strict=True):

@@ -23,10 +23,7 @@ SECONDS, SECONDS_PER_FACE = 60.0, 0.005  # processor time [s] that a mesh may ta
 
 
 def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return vertices and faces of each convex part into which CoACD cuts a mesh; `search` holds CoACD's settings.
-
-    Raises `MeshError` if CoACD takes more time or memory than is allowed for a mesh of this size.
-    """
+    """Return vertices and faces of each convex part of a mesh by CoACD with given settings, within time and memory."""
     from torchgrasp.errors import MeshError, MissingExtra
 
     if importlib.util.find_spec("coacd") is None:
@@ -48,9 +45,8 @@ def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.
             return [(found[f"v{k}"], found[f"f{k}"]) for k in range(len(found) // 2)]
     except (subprocess.TimeoutExpired, OSError, ValueError, EOFError, KeyError) as error:
         found = f"{len(mesh.faces)} faces that CoACD cannot cut in {seconds} s and {gibibytes} GiB"
-        raise MeshError(
-            "mesh", found, "a mesh that does not cross itself, with fewer faces; or give `parts`"
-        ) from error
+        allowed = "a mesh that does not cross itself, with fewer faces; or give `parts`"
+        raise MeshError("mesh", found, allowed) from error
 
 
 def main(asked: dict[str, Any]) -> None:

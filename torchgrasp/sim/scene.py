@@ -22,24 +22,14 @@ NEIGHBOURS, TABLETOP, TARGET = range(3)
 
 @dataclasses.dataclass(frozen=True)
 class StepContacts:
-    """True contacts of f fingers with the object, summed over a simulation step.
+    """True contacts of f fingers with the object, summed over a simulation step."""
 
-    Args:
-        impulse: normal impulse on the object (f, 3) [N s], without friction.
-        moment: contact points weighted by the size of their impulse (f, 3) [N s m].
-        weight: sum of the impulse sizes (f,) [N s]; `moment / weight` is the mean contact point.
-        finger: whether each finger touches (f,), with its tip or with the link that carries the tip.
-        force: force of each fingertip on the object (f, 3) [N], friction included.
-        stray: sums of other normal impulses (3,) [N s]: of the hand on neighbours, of the hand on the table, and of
-            other links than fingertips on the object.
-    """
-
-    impulse: np.ndarray
-    moment: np.ndarray
-    weight: np.ndarray
-    finger: np.ndarray
-    force: np.ndarray
-    stray: np.ndarray
+    impulse: np.ndarray  # normal impulse on the object (f, 3) [N s], without friction
+    moment: np.ndarray  # contact points weighted by the size of their impulse (f, 3) [N s m]
+    weight: np.ndarray  # sum of the impulse sizes (f,) [N s]; `moment / weight` is the mean contact point
+    finger: np.ndarray  # whether each finger touches (f,), with its tip or with the link that carries the tip
+    force: np.ndarray  # of each fingertip on the object (f, 3) [N], friction included
+    stray: np.ndarray  # sums of other impulses (3,) [N s]: hand on neighbours, hand on table, links on object
 
     @classmethod
     @checked
@@ -50,16 +40,12 @@ class StepContacts:
 
 
 class ContactPoint(NamedTuple):
-    """A point where two bodies touch, at `place` (3,) [m], with the normal impulse on the second body (3,) [N s].
+    """A point where two bodies touch, with the impulse and the force on the second body."""
 
-    `size` [N s] is the length of the impulse. `force` (3,) [N] on the second body includes friction; it is 0 if the
-    simulator does not report friction at contact points.
-    """
-
-    impulse: np.ndarray
-    size: float
-    place: np.ndarray
-    force: np.ndarray | float = 0.0
+    impulse: np.ndarray  # normal impulse (3,) [N s]
+    size: float  # length of the impulse [N s]
+    place: np.ndarray  # (3,) [m]
+    force: np.ndarray | float = 0.0  # (3,) [N], friction included; 0 if the simulator does not report it
 
 
 class Scene(abc.ABC):

@@ -41,10 +41,7 @@ class Guess(NamedTuple):
 def guess_pads(
     urdf: Urdf, frames: Float[Tensor, "3 4 _ n"], tips: Sequence[str], surfaces: Mapping[str, Points]
 ) -> Guess:
-    """Guess the pads of the fingertips and the direction out of the palm from random postures.
-
-    `frames` are the poses of the tips and then the palm, `surfaces` the points [m] on each link in its frame.
-    """
+    """Guess pads and the way out of the palm from poses of the tips, then the palm, and points on each link [m]."""
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
     tip_frames = frames[:, :, :-1]

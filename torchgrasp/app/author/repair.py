@@ -64,23 +64,21 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
     while True:
         links, parents = {x.name: x for x in urdf.links}, {j.parent for j in urdf.joints}
         for j in (j for j in urdf.joints if j.kind == "fixed"):
-            child, bare_root = (
-                links[j.child],
-                j.parent == urdf.root and not (links[j.parent].mass > 0 or links[j.parent].shapes),
-            )
+            child, parent = links[j.child], links[j.parent]
+            bare_root = j.parent == urdf.root and not (parent.mass > 0 or parent.shapes)
             frame = not child.mass > 0 and (j.child in parents or not child.shapes)
             if frame or bare_root:
                 break
         else:
             return urdf, [f"frames without mass are merged into others: {', '.join(taken)}"] if taken else [], taken
-        moved, parent = _moved(child, pose_of(j)), links[j.parent]
-        body = moved if bare_root else parent
-        merged = dataclasses.replace(body, name=parent.name, shapes=parent.shapes + moved.shapes)
+        moved = _moved(child, pose_of(j))
+        merged = dataclasses.replace(
+            moved if bare_root else parent, name=parent.name, shapes=parent.shapes + moved.shapes
+        )
         below = tuple(_under(x, j) if x.parent == child.name else x for x in urdf.joints if x is not j)
         kept = tuple(merged if x is parent else x for x in urdf.links if x is not child)
-        taken = {name: parent.name if to == child.name else to for name, to in taken.items()} | {
-            child.name: parent.name
-        }
+        taken = {name: parent.name if to == child.name else to for name, to in taken.items()}
+        taken[child.name] = parent.name
         urdf = dataclasses.replace(urdf, links=kept, joints=below)
 
 
@@ -216,9 +214,9 @@ def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
             inertia = mass / 12 * np.diag(size @ size - size**2)
             link = Link(link.name, mass, (x, y, z), _triangle(inertia), link.shapes)
         links.append(link)
-    done = (
-        [f"links without mass get the mass of half their bounding box: {', '.join(weightless)}"] if weightless else []
-    )
+    done = []
+    if weightless:
+        done.append(f"links without mass get the mass of half their bounding box: {', '.join(weightless)}")
     if absurd:
         done.append(
             f"{', '.join(absurd)} with an inertia or mass centre that is impossible for their size and mass get those "
@@ -268,7 +266,6 @@ def _add(above: ET.Element, tag: str, **attributes: str | float | Sequence[float
     """Add an XML element whose attributes are texts, numbers or lists of numbers; negative zero is written as zero."""
     element = ET.SubElement(above, tag)
     for key, value in attributes.items():
-        element.set(
-            key, value if isinstance(value, str) else " ".join(f"{x + 0.0!r}" for x in np.ravel(value).tolist())
-        )
+        numbers = () if isinstance(value, str) else np.ravel(value).tolist()
+        element.set(key, value if isinstance(value, str) else " ".join(f"{x + 0.0!r}" for x in numbers))
     return element

@@ -215,10 +215,8 @@ class _WithoutMarkup:
 
     def write(self, text: str) -> int:
         """Write the text with its markup removed. If the text is framed, the right border stays aligned."""
-        room = " " * len("[bold][/bold]")
-        return self.stream.write(
-            re.sub(r"\[bold\](.*?)\[/bold\](.*?)( │?)$", rf"\1\2{room}\3", text, flags=re.MULTILINE)
-        )
+        plain = rf"\1\2{' ' * len('[bold][/bold]')}\3"
+        return self.stream.write(re.sub(r"\[bold\](.*?)\[/bold\](.*?)( │?)$", plain, text, flags=re.MULTILINE))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)

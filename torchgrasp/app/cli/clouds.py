@@ -84,8 +84,7 @@ class CloudCut(Command):
     out: Path = required(OUT_CLOUD_HELP)
     view: ViewOptions = nested(ViewOptions())
     point: tuple[float, float, float] | None = option(
-        None,
-        "a point on or near the object; points farther than 0.5 m away are left out. By default the largest",
+        None, "a point on or near the object; points farther than 0.5 m away are left out. By default the largest"
     )
     box: tuple[float, float, float, float, float, float] | None = option(None, "two corners of a box to cut first")
     gap: float = option(0.02, "least distance between two objects [m]")

@@ -67,8 +67,7 @@ class Evaluate(_Trials):
     )
     force: float | None = option(None, "normal force of the strongest finger [N]; by default as the protocol says")
     displaced: float | None = option(
-        None,
-        "lifts: most that the object is displaced on each axis of the table [m]; by default as the protocol says",
+        None, "lifts: most that the object is displaced on each axis of the table [m]; by default as the protocol says"
     )
     during: bool = option(False, "displace the object halfway through the approach, not before it")
     relook: bool = option(False, "lifts: a camera looks at the displaced object once more, before the approach")

@@ -108,9 +108,8 @@ class Import(Command):
         with naming(path="--out"):
             grasps.save(self.out)
         closed = int((grasps.status == Status.OK).sum())
-        print(
-            f"{len(grasps)} grasps of the {hand.name} hand, {closed} closed at friction {self.friction:g}: {self.out}"
-        )
+        some = f"{len(grasps)} grasps of the {hand.name} hand"
+        print(f"{some}, {closed} closed at friction {self.friction:g}: {self.out}")
         return 0 if closed else 1
 
     def _read(self, hand: Hand, quaternion: Quaternion, unit: Unit) -> Grasps:

@@ -71,15 +71,13 @@ class Grasp(Command):
     hand: str = option("allegro", HAND_HELP)
     out: Path | None = option(None, "folder of the results; by default out/ and the name of the object")
     mesh: Path | None = option(
-        None,
-        "true mesh of the object [m] in the frame of the cloud, for the simulator; a shipped object has one",
+        None, "true mesh of the object [m] in the frame of the cloud, for the simulator; a shipped object has one"
     )
     close: bool = option(False, 'close the best grasp on the mesh, lift it and hold it (needs the extra "sim")')
     seed: Seed = option(0, "random seed; the same seed gives the same grasps")
     starts: Count = option(1000, STARTS_HELP)
     time_budget: float | None = option(
-        None,
-        "seconds for planning; the batch that ends after them is the last. By default there is no limit",
+        None, "seconds for planning; the batch that ends after them is the last. By default there is no limit"
     )
     view: CloudOptions = nested(CloudOptions())
     friction: float = option(0.8, "coefficient of friction between fingertips and object")
@@ -87,8 +85,7 @@ class Grasp(Command):
         "default", f'{FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely to succeed'
     )
     mode: Mode = option(
-        "joint",
-        "contacts, pose and joints together; contacts first, then the learned model; or the paper as written",
+        "joint", "contacts, pose and joints together; contacts first, then the learned model; or the paper as written"
     )
     label: int | None = option(None, "label of the object to grasp in a scene; by default the easiest")
     point: tuple[float, float] | None = option(None, "column and row of a pixel on the object to grasp in a scene")

@@ -169,9 +169,8 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
             )
     closing = float(can_close(points, normals).double().mean()) if len(points) else 0.0
     if closing < least_closing:
-        warnings.append(
-            f"{closing:.2%} of free postures can hold an object: give {named} the thumb and fingers that it faces"
-        )
+        fix = f"give {named} the thumb and fingers that it faces"
+        warnings.append(f"{closing:.2%} of free postures can hold an object: {fix}")
     return warnings
 
 

@@ -107,10 +107,7 @@ class Canvas:
     def render_png(
         self, corners: Float[np.ndarray, "n 3"], direction: Direction, bar: tuple[str, float, str] | None = None
     ) -> bytes:
-        """Return a PNG of the scene, framed so that all `corners` [m] are visible.
-
-        `bar` is title, largest value and colour map of a colour bar at the bottom.
-        """
+        """Return a PNG that shows all `corners` [m]; `bar` is title, largest value and colour map of a bar below."""
         from PIL import Image
 
         image = Image.fromarray(self.render(frame_camera(corners, direction, 0.09 if bar else 0.0)))

@@ -97,7 +97,8 @@ def draw_pictures(run: Run) -> Sections:
 
 def format_page(run: Run, pictures: Sections, view: str = "") -> str:
     """Return the HTML report of a run, with a link to its 3D page `view`."""
-    explanation, outcomes = run.explanation, []
+    funnel, trials = (run.explanation.funnel.stages, run.explanation.trials) if run.explanation else ((), ())
+    outcomes = []
     if run.plan is not None:
         outcomes.append(("Outcome of every initial guess", run.plan.status))
     if len(run.grasps):
@@ -120,12 +121,8 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
         ],
         columns=GRASP_COLUMNS,
         rows=grasp_rows(run.executable),
-        lost=[
-            (x.stage, f"{x.kept} of {x.given} {x.things}", x.reasons) for x in explanation.funnel.stages if x.given
-        ] if explanation else [],
-        tried=[
-            (t.words, str(t.executable), f"{t.expected:.0%}") for t in explanation.trials
-        ] if explanation else [],
+        lost=[(x.stage, f"{x.kept} of {x.given} {x.things}", x.reasons) for x in funnel if x.given],
+        tried=[(t.words, str(t.executable), f"{t.expected:.0%}") for t in trials],
         outcomes=[
             (name, [(str(n), s.name.lower(), s.sentence) for s, n in count_status(status).items()])
             for name, status in outcomes

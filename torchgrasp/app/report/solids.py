@@ -17,16 +17,13 @@ EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot fing
 
 
 class Solid(NamedTuple):
-    """A mesh of one collision shape with vertex normals, and the indices of its link and finger.
-
-    The finger is `PARKED` if the link belongs to no grasping finger, such as the palm, or to several.
-    """
+    """A mesh of one collision shape with vertex normals, and the indices of its link and finger."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
     normals: Float[np.ndarray, "v 3"]
     link: int
-    finger: int
+    finger: int  # `PARKED` if the link belongs to no grasping finger, such as the palm, or to several
 
     @property
     def color(self) -> str:

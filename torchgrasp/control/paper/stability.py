@@ -61,19 +61,12 @@ class PreferredForces(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class StabilityModel(Value):
-    """Two Gaussian mixtures over grasp states of one hand: stable grasps, and all other grasps.
+    """Two Gaussian mixtures over grasp states of one hand: stable grasps, and all other grasps."""
 
-    Args:
-        stable: density of the states of stable grasps.
-        others: density of the states of all other grasps.
-        share: fraction of training trials that were stable: the prior probability.
-        meta: texts about the training: hand, bodies, trials, seed, and the scores on held-out bodies.
-    """
-
-    stable: GaussianMixture
-    others: GaussianMixture
-    share: Annotated[float, Range(LEAST, 1 - 2**-53, "a number in (0, 1)")]
-    meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
+    stable: GaussianMixture  # density of the states of stable grasps
+    others: GaussianMixture  # density of the states of all other grasps
+    share: Annotated[float, Range(LEAST, 1 - 2**-53, "a number in (0, 1)")]  # of stable trials: the prior
+    meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])  # hand, bodies, trials, seed, scores
 
     def __post_init__(self) -> None:
         for mixture in (self.stable, self.others):
@@ -123,12 +116,7 @@ class StabilityModel(Value):
 
 @checked
 def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel | None:
-    """Read the stability model of a hand from `path`, or from `FILE` in the hand's folder; None if that does not exist.
-
-    Raises:
-        ModelFileError: the file is missing or malformed.
-        BadArgument: the model is that of another hand.
-    """
+    """Read the stability model of a hand from `path`, or from `FILE` in its folder; None if that does not exist."""
     if path is None:
         path = hand.urdf_path.parent / FILE
         if not path.is_file():

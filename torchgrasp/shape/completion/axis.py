@@ -78,15 +78,11 @@ def fit_axis(points: Points, normals: Points) -> Float[Tensor, "2"]:
 
 
 class _Lines(NamedTuple):
-    """Lines along surface normals, seen from above: each line consists of the points x with across . x = offset [m].
+    """Lines along surface normals, seen from above: each line consists of the points x with across . x = offset [m]."""
 
-    `slope` and `level` are the length and the direction of a normal's horizontal part. `steep` tells whether this part
-    is long enough for a fit.
-    """
-
-    slope: Float[Tensor, "n"]
-    steep: Bool[Tensor, "n"]
-    level: Float[Tensor, "n 2"]
+    slope: Float[Tensor, "n"]  # length of a normal's horizontal part
+    steep: Bool[Tensor, "n"]  # whether this part is long enough for a fit
+    level: Float[Tensor, "n 2"]  # direction of this part
     across: Float[Tensor, "n 2"]
     offset: Float[Tensor, "n"]
 

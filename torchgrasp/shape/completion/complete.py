@@ -45,23 +45,16 @@ class Completion(Value):
     """Estimated points of the hidden side, with their errors along the normals.
 
     The errors have the covariance LEAST_NOISE^2 I + D D^T [m^2], where I is the identity and D is `deviations`.
-
-    Args:
-        shared: standard deviations [m] of the errors that each mirror plane causes.
-        asymmetry: standard deviation [m] of a smooth random error, because the object is not quite symmetric.
-        planes: the planes n.x = o that were used, as (n, o); for each part of the object, its best plane is first.
-        scores: score of each plane: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it.
-        kind: how the hidden side was completed, which selects the calibration.
     """
 
     points: Float[Tensor, "m 3"]
     normals: Float[Tensor, "m 3"]
-    shared: Float[Tensor, "m c"]
-    asymmetry: Float[Tensor, "m"]
-    planes: Float[Tensor, "p 4"]
-    scores: Float[Tensor, "p"]
+    shared: Float[Tensor, "m c"]  # standard deviations [m] of the errors that each mirror plane causes
+    asymmetry: Float[Tensor, "m"]  # standard deviation [m] of a smooth error, because the object is not quite symmetric
+    planes: Float[Tensor, "p 4"]  # planes n.x = o, as (n, o); for each part of the object, its best plane is first
+    scores: Float[Tensor, "p"]  # of the planes: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it
     outline: Outlines
-    kind: Kind
+    kind: Kind  # how the hidden side was completed, which selects the calibration
 
     @checked
     def moved(self, b_from_a: Pose) -> "Completion":
@@ -147,17 +140,13 @@ class _Part(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Image(Batch):
-    """The mirrored points [m] of a part, with score and errors; an unmirrored part has infinite score.
-
-    `variance` [m^2] is due to asymmetry. `shared` [m] is the shift of each point when the mirror is replaced by a
-    nearby plane, weighted by the root of the plane's probability.
-    """
+    """The mirrored points [m] of a part, with score and errors."""
 
     points: Tensor
     normals: Tensor
-    score: float
-    variance: Float[Tensor, "n"]
-    shared: Float[Tensor, "n planes near"]
+    score: float  # infinite if the part is not mirrored
+    variance: Float[Tensor, "n"]  # [m^2], of asymmetry
+    shared: Float[Tensor, "n planes near"]  # shift [m] for each nearby plane, weighted by the root of its probability
 
     @classmethod
     def of(cls, scorer: SymmetryScorer, points: Tensor, normals: Tensor, n_planes: int) -> "_Image":

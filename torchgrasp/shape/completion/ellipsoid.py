@@ -26,18 +26,12 @@ UPPER = np.triu_indices(3)  # entries of a symmetric matrix that are parameters
 
 @dataclasses.dataclass(frozen=True)
 class Ellipsoid:
-    """An ellipsoid fitted to a cloud.
-
-    Args:
-        points, normals: points [m] and normals spread over the whole ellipsoid.
-        deviations: standard deviations [m] of each point along its normal, one column per independent source of error.
-        misfit: RMS distance [m] of the cloud from the ellipsoid.
-    """
+    """An ellipsoid fitted to a cloud: points [m] and normals spread over all of it."""
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]
-    deviations: Float[Tensor, "n 9"]
-    misfit: float
+    deviations: Float[Tensor, "n 9"]  # standard deviations [m] along the normals, one column per independent error
+    misfit: float  # RMS distance [m] of the cloud from the ellipsoid
 
 
 def find_ellipsoid(points: Points, normals: Points, outline: Outlines, table: float | None) -> Ellipsoid | None:
@@ -87,9 +81,8 @@ class _Fit:
         radius = np.log(np.clip(np.sqrt(max(ball[3] + ball[:3] @ ball[:3], 0.0)), longest / 4, longest))
         start = np.concatenate([ball[:3], radius * np.eye(3)[UPPER]])
         jacobian: Any = self.jacobian  # of which SciPy's annotations do not know
-        found = least_squares(
-            lambda x: self.residuals(x[None])[0], start, jacobian, x_scale="jac", loss="soft_l1", max_nfev=40
-        )
+        options: Any = {"x_scale": "jac", "loss": "soft_l1", "max_nfev": 40}
+        found = least_squares(lambda x: self.residuals(x[None])[0], start, jacobian, **options)
         return found.x, np.linalg.inv(found.jac.T @ found.jac)
 
     def jacobian(self, parameters: np.ndarray) -> np.ndarray:
@@ -99,10 +92,7 @@ class _Fit:
         return ((found[1:] - found[0]) / step[:, None]).T
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Return residuals of points, normals, outline, table and prior, each divided by its deviation.
-
-        There is one row per ellipsoid.
-        """
+        """Return residuals of points, normals, outline, table and prior over their deviations, a row per ellipsoid."""
         distance, normal = self.distance_and_normal(parameters)
         share, k = np.sqrt(len(self.points) / INDEPENDENT), len(parameters)
         shape = _symmetric(parameters[:, 3:])

@@ -22,29 +22,18 @@ TIE = 2e-9  # relative difference of squared distances by rounding: the frame mu
 
 @dataclasses.dataclass(frozen=True)
 class Silhouette(Value):
-    """The outline and visible depth of one view, as rasters on the image plane at depth 1.
-
-    Args:
-        axes: right, down and forward axis of the camera, as rows.
-        corner, cell: first node of the raster and spacing of the nodes, at depth 1.
-        outside: signed distance to the outline at depth 1, positive outside.
-        depth: at each node, the depth [m] of the visible pixel nearest to the node.
-        rim: points of the outline [m] at the visible depth.
-        rim_normals: surface normals at the rim points, perpendicular to the camera rays.
-        cut: whether the object reaches the border of the image. Points beyond the border do not count as outside.
-        gap: greatest width [m] of an area within the outline without measurements, perhaps a hole; 0 if there is none.
-    """
+    """The outline and visible depth of one view, as rasters on the image plane at depth 1."""
 
     viewpoint: Float[Tensor, "3"]
-    axes: Float[Tensor, "3 3"]
-    corner: Float[Tensor, "2"]
-    cell: float
-    outside: Float[Tensor, "h w"]
-    depth: Float[Tensor, "h w"]
-    rim: Float[Tensor, "k 3"]
-    rim_normals: Float[Tensor, "k 3"]
-    cut: bool
-    gap: float
+    axes: Float[Tensor, "3 3"]  # right, down and forward axis of the camera, as rows
+    corner: Float[Tensor, "2"]  # first node of the raster, at depth 1
+    cell: float  # spacing of the nodes, at depth 1
+    outside: Float[Tensor, "h w"]  # signed distance to the outline at depth 1, positive outside
+    depth: Float[Tensor, "h w"]  # at each node, the depth [m] of the visible pixel nearest to the node
+    rim: Float[Tensor, "k 3"]  # points of the outline [m] at the visible depth
+    rim_normals: Float[Tensor, "k 3"]  # at the rim points, perpendicular to the camera rays
+    cut: bool  # whether the object reaches the border of the image; points beyond do not count as outside
+    gap: float  # width [m] of the widest area within the outline without measurements, perhaps a hole, or 0
 
     @checked(gradients=True)
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -126,12 +115,7 @@ class Outlines(Value):
 
 @checked
 def silhouettes(cloud: PointCloud) -> Outlines:
-    """Return the silhouette of every view of a cloud with viewpoints.
-
-    Raises:
-        BadArgument: a cloud without viewpoint, points beside or behind their camera, or a view that shows both sides of
-            the object.
-    """
+    """Return the silhouette of every view of a cloud; refuse a view without camera, or of both sides of the object."""
     views = cloud.split_views()
     for view in views:
         if view.viewpoint is None:

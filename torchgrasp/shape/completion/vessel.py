@@ -23,23 +23,14 @@ CENTER_ERROR, FORM_ERROR, FLOOR_ERROR = 0.0006, 0.001, 0.003  # deviations [m] o
 
 @dataclasses.dataclass(frozen=True)
 class Vessel(Value):
-    """An open vessel with a vertical axis; lengths in metres.
+    """An open vessel with a vertical axis; lengths in metres."""
 
-    Args:
-        center: position (x, y) of the axis.
-        thickness: thickness of the wall, the mean of the fitted and the usual thickness, weighted by certainty.
-        radius: outer radius of the mouth.
-        rim: height of the mouth.
-        inner: mask of the points seen through the mouth.
-        body: mask of the points on either wall, without handles, rim and floor.
-    """
-
-    center: Float[Tensor, "2"]
-    thickness: float
-    radius: float
-    rim: float
-    inner: Bool[Tensor, "n"]
-    body: Bool[Tensor, "n"]
+    center: Float[Tensor, "2"]  # position (x, y) of the axis
+    thickness: float  # of the wall, the mean of the fitted and the usual one, weighted by certainty
+    radius: float  # outer radius of the mouth
+    rim: float  # height of the mouth
+    inner: Bool[Tensor, "n"]  # mask of the points seen through the mouth
+    body: Bool[Tensor, "n"]  # mask of the points on either wall, without handles, rim and floor
 
 
 def find_vessel(points: Points, normals: Points) -> Vessel | None:
@@ -155,9 +146,7 @@ def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
     axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64, device="cpu")])
     points = (wall.points - axis) @ turn.mT + axis
     normals = wall.normals @ turn.mT
-    moved = (torch.eye(3, dtype=torch.float64, device="cpu") - turn)[
-        :, None
-    ] * CENTER_ERROR  # of a turned point with the axis
+    moved = CENTER_ERROR * (torch.eye(3, dtype=torch.float64, device="cpu") - turn)[:, None]  # a point, with the axis
     shared = wall.shared.expand(len(turn), -1, -1).clone()
     shared[..., :2] += (normals[..., None, :] @ moved)[..., 0, :2]
     return HiddenWall(points.flatten(0, 1), normals.flatten(0, 1), shared.flatten(0, 1))
@@ -178,10 +167,7 @@ def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float
 
 
 def _merge(seen: Points, outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float) -> HiddenWall:
-    """Return the points of the parts that are hidden, below the rim and above the height `least`.
-
-    Points near the seen points, or near points of an earlier part, are left out.
-    """
+    """Return the hidden points of the parts, between rim and `least` height, apart from seen and earlier points."""
     from scipy.spatial import KDTree
 
     tree = KDTree(seen.numpy())
