@@ -13,6 +13,7 @@ from torchgrasp.app.report.evaluation import format_evaluation, list_causes
 from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.evaluation import GraspTrial, Truth
 from torchgrasp.evaluation.causes import CAUSES, find_cause
+from torchgrasp.evaluation.regrasp import LiftTry
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore, summarise
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
@@ -57,7 +58,7 @@ def record(moved=None, turned=None, rises=True, status=Status.DROPPED, order=(0,
 
 
 def cause(off=0.0, spec=SPEC, **motion):
-    return find_cause(record(**motion), trial(off), spec)
+    return find_cause([LiftTry(0, record(**motion))], trial(off), spec)
 
 
 X, Z = real([1.0, 0.0, 0.0]), real([0.0, 0.0, 1.0])
@@ -101,7 +102,7 @@ def test_the_first_cause_counts_and_the_first_motion_in_the_hand():
 def test_the_motion_of_an_object_that_slides_by_itself_is_not_the_hands():
     slid = trial()
     slid = dataclasses.replace(slid, truth=dataclasses.replace(slid.truth, slide=0.05 * X))
-    found = [find_cause(record(moved=ramp(0.2, 0.4) * x * X), slid, SPEC)[0] for x in (0.05, 0.031, 0.0)]
+    found = [find_cause([LiftTry(0, record(moved=ramp(0.2, 0.4) * x * X))], slid, SPEC)[0] for x in (0.05, 0.031, 0.0)]
     assert found == ["slid", "slid", "pushed away"]
 
 
@@ -111,7 +112,7 @@ def test_a_later_try_is_judged_from_where_the_try_before_left_the_object():
     second = record(moved=ramp(0.0, 0.9) * 0.021 * X)
     aside = rigid(torch.eye(3).double(), -0.05 * X)
     about = dataclasses.replace(second, object_pose=rigid(torch.eye(3).double(), 0.05 * X) @ second.object_pose @ aside)
-    assert find_cause(about, trial(), SPEC, [first]) == ("pushed away", pytest.approx(21.0))
+    assert find_cause([LiftTry(0, first), LiftTry(0, about)], trial(), SPEC) == ("pushed away", pytest.approx(21.0))
 
 
 def test_a_held_overlapping_or_unfinished_trial():

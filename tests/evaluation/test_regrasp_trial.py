@@ -78,8 +78,8 @@ def trial(*poses, **truth) -> GraspTrial:
 def test_a_trial_of_a_single_grasp_is_the_same_to_the_last_bit():
     pytest.importorskip("sapien")
     one = trial(placed())
-    (found,) = lift_grasps(one, QUICK)
-    (first,) = lift_grasps(dataclasses.replace(one, grasp=several(placed(), MISSED)), QUICK, tries=1)
+    ((_, found),) = lift_grasps(one, QUICK)
+    ((_, first),) = lift_grasps(dataclasses.replace(one, grasp=several(placed(), MISSED)), QUICK, tries=1)
     assert digest(found) == digest(first) == digest(lift_grasp(one, QUICK))
 
 
@@ -88,8 +88,8 @@ def test_a_trial_of_a_single_grasp_is_the_same_to_the_last_bit():
 def test_a_hand_that_closed_beside_the_object_holds_it_with_the_second_grasp(simulator):
     pytest.importorskip(simulator)
     spec = dataclasses.replace(STILL, simulator=simulator)
-    missed, held = lift_grasps(trial(MISSED, placed()), spec)
-    assert (missed.status, held.status) == (Status.NO_CONTACT, Status.OK)
+    (_, missed), (row, held) = lift_grasps(trial(MISSED, placed()), spec)
+    assert (missed.status, row, held.status) == (Status.NO_CONTACT, 1, Status.OK)
     away = torch.linalg.vector_norm(missed.hand_pose[-1, :3, 3] - missed.hand_pose[0, :3, 3])
     assert float(away) < 0.005  # it is back where it came from, and open
     assert float((missed.joints[-1] - missed.joints[0]).abs().max()) < 0.05
@@ -98,7 +98,7 @@ def test_a_hand_that_closed_beside_the_object_holds_it_with_the_second_grasp(sim
 @pytest.mark.sim
 def test_a_held_object_is_not_tried_again_and_the_last_try_ends_the_trial():
     pytest.importorskip("sapien")
-    (held,) = lift_grasps(trial(placed(), placed(90.0)), STILL)
+    ((_, held),) = lift_grasps(trial(placed(), placed(90.0)), STILL)
     assert held.held
     failed = run_protocol(trial(MISSED, placed(0.0, 0.35), placed()), Protocol("twice", STILL, tries=2))
     assert (failed.passed, failed.tries, failed.status) == (False, 2, Status.NO_CONTACT)

@@ -13,7 +13,7 @@ from torchgrasp.closure import ClosureResult
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
 from torchgrasp.evaluation.lift import LIFT_TIME
-from torchgrasp.evaluation.regrasp import next_grasp
+from torchgrasp.evaluation.regrasp import LiftTry
 from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.geometry.mesh import read_mesh
@@ -35,23 +35,20 @@ CAUSES = {
 
 
 @checked
-def find_cause(
-    lift: ClosureResult, trial: GraspTrial, spec: TrialSpec, before: Sequence[ClosureResult] = ()
-) -> tuple[str, float]:
-    """Return why the object of a lift was not held (`CAUSES`), and the size of the cause; "" and NaN if it was held.
+def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> tuple[str, float]:
+    """Return why the object was not held in the last try of a trial (`CAUSES`), and the size of the cause.
 
-    `before` are the results of the tries before this lift (`lift_grasps`).
+    The result is "" and NaN if the object was held.
     """
+    (*before, (row, lift)), truth = tries, trial.truth
     if lift.held or lift.status is Status.UNSTABLE:
         return "", math.nan
     if lift.status is Status.START_OVERLAP:
         return "start overlap", 1e3 * lift.start_overlap
-    tried, truth = [0], trial.truth
-    for result in reversed(before):  # each record begins with the object where the try before left it
+    for _, result in reversed(before):  # each record begins with the object where the try before left it
         lift = dataclasses.replace(lift, object_pose=lift.object_pose @ result.object_pose[-1])
-        tried.append(next_grasp(trial.grasp, tried) or 0)
         truth = dataclasses.replace(truth, slide=None)
-    trial = dataclasses.replace(trial, grasp=trial.grasp[tried[-1]], truth=truth)
+    trial = dataclasses.replace(trial, grasp=trial.grasp[row], truth=truth)
     return next((cause, size) for cause, size, least in _sizes(lift, trial, spec) if size > least)
 
 

@@ -14,7 +14,7 @@ from torchgrasp.closure import ObjectMotion
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.causes import find_cause
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, draw_push, find_protocol, seed_of
-from torchgrasp.evaluation.regrasp import lift_grasps
+from torchgrasp.evaluation.regrasp import run_lifts
 from torchgrasp.evaluation.score import ProtocolResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.geometry.frames import rotation_angle
@@ -139,12 +139,13 @@ def run_protocol(
         status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
         slip, passed, cause, size = ObjectMotion(math.nan, math.nan), status is Status.OK, "", math.nan
     else:
-        *before, lift = lift_grasps(trial, protocol.trial, protocol.tries)
+        lifts = run_lifts(driver, trial.grasp, protocol.tries)
+        tries, lift = len(lifts), lifts[-1].result
         status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
         force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
-        tries, risen = len(before) + 1, lift.rise >= 0.5 * protocol.trial.lift_height
+        risen = lift.rise >= 0.5 * protocol.trial.lift_height
         passed = lift.held if protocol.criterion == "held" else risen
-        cause, size = find_cause(lift, trial, protocol.trial, before)
+        cause, size = find_cause(lifts, trial, protocol.trial)
     spent = time.process_time() - started
     measured = moved, turned, force, overlap, spent, *slip
     return ProtocolResult(rank, draw, passed, status, *measured, tries=tries, cause=cause, size=size)

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -40,10 +41,17 @@ def next_grasp(grasps: Grasps, tried: Sequence[int]) -> int | None:
     return int(fresh[0]) if len(fresh) else None
 
 
+class LiftTry(NamedTuple):
+    """One try of a trial over several grasps: the row of the grasp that was tried, and the result of its lift."""
+
+    row: int
+    result: ClosureResult
+
+
 @checked
 @single_threaded
-def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3) -> tuple[ClosureResult, ...]:
-    """Lift an object with the first grasp of a trial, and with others where a lift fails; return a result for each try.
+def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3) -> tuple[LiftTry, ...]:
+    """Lift an object with the first grasp of a trial, and with others where a lift fails; return all tries.
 
     Where the hand feels that the object stays behind (`LiftCheck`) or is too heavy, the hand goes down, opens and
     withdraws. The object stays where it then is. The robot expects it where the touches of the last try tell, or looks
@@ -61,23 +69,30 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
     >>> trial = GraspTrial(load_hand("allegro"), grasp, Truth(jug.mesh, jug.parts))
-    >>> [result.held for result in lift_grasps(trial, TrialSpec(hold_time=0.2))]
-    [True]
+    >>> [(row, result.held) for row, result in lift_grasps(trial, TrialSpec(hold_time=0.2))]
+    [(0, True)]
     """
-    spec, grasps, tried, results = TrialSpec() if spec is None else spec, trial.grasp, [0], []
+    first = dataclasses.replace(trial, grasp=trial.grasp[0])
+    return run_lifts(TrialDriver(first, TrialSpec() if spec is None else spec), trial.grasp, tries)
+
+
+def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry, ...]:
+    """Run the trial of the first of several grasps, and trials of others where a lift fails."""
+    spec, tried, done = driver.spec, [0], []
     while True:
-        trial = dataclasses.replace(trial, grasp=grasps[tried[-1]])
         following = next_grasp(grasps, tried) if len(tried) < tries else None
         if following is None:  # the last try lifts whatever it feels
-            return *results, run_lift(TrialDriver(trial, spec))
-        lift, started = _CheckedLift(TrialDriver(trial, spec).open()), time.perf_counter()
-        results.append(lift.result(lift.perform(), time.perf_counter() - started))
-        if not (lift.check.lost or results[-1].status is Status.TOO_HEAVY):
-            return tuple(results)
+            return *done, LiftTry(tried[-1], run_lift(driver))
+        lift, started = _CheckedLift(driver.open()), time.perf_counter()
+        result = lift.result(lift.perform(), time.perf_counter() - started)
+        done.append(LiftTry(tried[-1], result))
+        if not (lift.check.lost or result.status is Status.TOO_HEAVY):
+            return tuple(done)
         tried.append(following)
-        pose, felt = grasps.obj_from_hand[following].to("cpu", torch.float64), _felt(lift.run.controller)
-        truth = _left_behind(trial, results[-1], felt, pose)
-        trial = dataclasses.replace(trial, truth=truth, seed=seed_of(trial.seed, "again"))
+        trial, pose = driver.trial, grasps.obj_from_hand[following].to("cpu", torch.float64)
+        truth = _left_behind(trial, result, _felt(lift.run.controller), pose)
+        seed = seed_of(trial.seed, "again")
+        driver = TrialDriver(dataclasses.replace(trial, grasp=grasps[following], truth=truth, seed=seed), spec)
 
 
 class _CheckedLift(_Lift):
