@@ -9,7 +9,7 @@ import torch
 
 from tests.pinch import pinch
 from torchgrasp import load_object
-from torchgrasp.base import Value, check_number, check_whole, count_status, join, pick, put
+from torchgrasp.base import Value, check_whole, count_status, join, pick, put
 from torchgrasp.errors import BadArgument, FailedRows, Status, TooFewPoints
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Certificate, ContactPlan, Contacts, PointCloud
@@ -111,12 +111,6 @@ def test_to_returns_a_new_value_and_keeps_integers():
 def test_what_is_no_whole_number_of_the_range_is_a_bad_argument(value):
     with pytest.raises(BadArgument, match=r"^edges: expected .*got "):
         check_whole("edges", value, 3, 1024)
-
-
-@pytest.mark.parametrize("value", ["0.8", False, None, math.inf], ids=repr)
-def test_what_is_no_number_of_the_range_is_a_bad_argument(value):
-    with pytest.raises(BadArgument, match=r"^friction: expected .*got "):
-        check_number("friction", value, 0.0, 10.0)
 
 
 def test_values_are_frozen():

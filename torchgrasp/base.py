@@ -215,8 +215,3 @@ def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
 def check_whole(name: str, value: Any, low: int, high: int) -> None:
     """Raise `BadArgument` unless a value is a whole number in [low, high]."""
     read_number(name, value, int, Range(low, high))
-
-
-def check_number(name: str, value: Any, low: int | float, high: int | float) -> None:
-    """Raise `BadArgument` unless a value is a number in [low, high]."""
-    read_number(name, value, float, Range(low, high))

@@ -27,7 +27,8 @@ def few_starts(monkeypatch):
     monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 12)
 
 
-def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys):
+def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys, monkeypatch):
+    monkeypatch.setattr("torchgrasp.app.cli.hands._try_objects", lambda hand, bar: True)
     (barrett / "hand.toml").unlink()
     assert main(["hand", "new", str(barrett / "hand.urdf"), "--name", "mine"]) == 0
     assert "CHECK" in capsys.readouterr().out

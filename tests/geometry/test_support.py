@@ -8,7 +8,7 @@ from tests.make import box, real
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
-from torchgrasp.geometry.support import find_supports, fit_support
+from torchgrasp.geometry.support import find_supports
 from torchgrasp.scene.image import read_image
 
 POSE = look_at(30.0, 40.0, 0.6)
@@ -19,6 +19,10 @@ THINGS = [
     box([0.1, 0.06, 0.12], [0.05, 0.05, 0.06]),
     trimesh.creation.icosphere(radius=0.04).apply_translation([-0.08, 0.0, 0.04]),
 ]
+
+
+def fit_support(*view):
+    return find_supports(*view)[0].plane
 
 
 def look(meshes, table=0.0, pose=POSE):

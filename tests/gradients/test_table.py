@@ -171,7 +171,8 @@ def test_a_row_of_the_table(name: str, check: str):
 @pytest.mark.slow
 def test_compiled_rows_are_the_same():
     """In a process of its own: the checks of annotations, which tests add to each function, cannot be compiled."""
-    alike = "HollowShape", ".sample", ".joint"  # they take minutes, and share their code with `ShapeGP.predict`
+    alike = "HollowShape", ".sample", ".joint", "distance_rows"  # they share their code with `ShapeGP.predict`
+    alike += "SelfCollision", "log_joint", ".marginal"  # and these with `Hand.self_clearance` and `log_prob`
     names = [name for name, row in ROWS.items() if "compile" not in row.lacks and not ALIKE(name)]
     names = [name for name in names if not any(part in name for part in alike)]
     code = f"from tests.gradients.compare import compile_rows; compile_rows({names})"

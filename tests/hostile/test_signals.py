@@ -83,9 +83,16 @@ if __name__ == "__main__":
 
 @pytest.mark.promise("F6")
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize(("sign", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
+@pytest.mark.parametrize(
+    ("send", "sign", "code", "said"),
+    [
+        ("killpg", "SIGINT", 130, "interrupted"),
+        ("kill", "SIGINT", 130, "interrupted"),
+        ("kill", "SIGTERM", 143, "terminated"),
+    ],
+)
 def test_a_command_that_is_told_to_end_says_so_alone_and_leaves_nothing(
-    tmp_path: Path, sign: str, code: int, said: str
+    tmp_path: Path, send: str, sign: str, code: int, said: str
 ):
     """A terminal sends Ctrl-C to all processes of a command; its worker says nothing, and its folder is let go."""
     pytest.importorskip("pebble")
@@ -95,7 +102,7 @@ def test_a_command_that_is_told_to_end_says_so_alone_and_leaves_nothing(
     run = start_process(command, start_new_session=True)
     while run.poll() is None and not mark.exists():
         time.sleep(0.05)
-    os.killpg(run.pid, getattr(signal, sign))
+    getattr(os, send)(run.pid, getattr(signal, sign))  # to all processes of the command, or to the command alone
     _, told = run.communicate()
     assert (run.returncode, told) == (code, f"torchgrasp: {said}\n")
     assert sorted(tmp_path.iterdir()) == [mark, script]

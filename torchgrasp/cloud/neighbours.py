@@ -50,8 +50,8 @@ def fit_planes(
     points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
     """Fit a plane around each point in `rows`, by default each point; return normals of any sign and rms errors [m]."""
-    near, weight = _neighbourhood(points, 25, rows)  # about eight for each of a plane's three unknowns
-    mean_squares, axes = _principal_axes(near, weight)
+    distance, index = nearest(points, 25, rows)  # about eight for each of a plane's three unknowns
+    mean_squares, axes = _principal_axes(points[index], _weigh(distance))
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
 
@@ -84,14 +84,6 @@ def _fit_block(
     gradient = torch.stack([torch.ones_like(size[:, 0]), -quadric[:, 1] / size[:, 0], -quadric[:, 2] / size[:, 0]], -1)
     feet = points + quadric[:, :1] * axes[..., 0]
     return feet, unit((axes @ gradient[..., None])[..., 0]), (weight * residual**2).sum(-1).sqrt()
-
-
-def _neighbourhood(
-    points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
-) -> tuple[Float[Tensor, "m k 3"], Float[Tensor, "m k"]]:
-    """Return the k points nearest to each point in `rows`, by default to every point, and their weights."""
-    distance, index = nearest(points, k, rows)
-    return points[index], _weigh(distance)
 
 
 def _weigh(distance: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:

@@ -125,7 +125,8 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Float[Tensor, "3"] | None =
         if viewpoint is None:
             viewpoint = guess_viewpoint(points.double(), normals, up)[0].to(points.dtype)
         outward = viewpoint.double() - points.double()
-    normals = orient_normals(normals, outward).to(points.dtype)
+    sign = torch.where((outward * normals).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    normals = unit(sign * normals).to(points.dtype)
     return dataclasses.replace(cloud, points=points, normals=normals, viewpoint=viewpoint)
 
 
@@ -144,12 +145,6 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     flipped = 2 * against.sum(-1) > compared.sum(-1)
     # Random signs oppose half of the pairs.
     return NormalCheck(flipped, opposed, oriented=opposed < 0.35, scaled=int(scaled.sum()))
-
-
-def orient_normals(normals: Float[Tensor, "n 3"], outward: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Return unit normals, each reversed if needed, so that it points to the side of its `outward` direction."""
-    sign = torch.where((outward * normals).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-    return unit(sign * normals)
 
 
 def share_facing(

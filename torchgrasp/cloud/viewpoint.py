@@ -9,7 +9,7 @@ from torch import Tensor
 from torchgrasp.cloud.neighbours import draw_rows, nearest
 from torchgrasp.errors import NoSupport
 from torchgrasp.geometry.linalg import fibonacci_sphere, unit
-from torchgrasp.geometry.support import fit_support
+from torchgrasp.geometry.support import find_supports
 
 MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
 """Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""
@@ -38,7 +38,7 @@ def guess_viewpoint(
     if far and above and bool(in_front.all()) and can_see(points, normals, torch.zeros_like(points[0])):
         return torch.zeros_like(points[0]), 15.0
     try:
-        up = fit_support(points, up=up).normal
+        up = find_supports(points, up=up)[0].plane.normal
     except NoSupport:
         pass
     directions = fibonacci_sphere(400).to(points)  # about 10 degrees apart
@@ -70,7 +70,7 @@ def can_see(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoi
     if bool(density[0] > 0) or bool(score[0] > score.max() - 0.5):
         return True
     try:
-        fit_support(points, viewpoint)
+        find_supports(points, viewpoint)
     except NoSupport:
         return False
     return True

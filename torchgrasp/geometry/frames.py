@@ -99,12 +99,8 @@ def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the pose `a_from_vf` of the virtual frame of three contacts given in frame a, Eqs. (15)-(17) of the paper.
 
     The origin is the centroid of the contacts (Eq. 16). The x axis points from the first contact to the third. The z
-    axis is the normal of their plane.
-
-    Inside torch.vmap, where numbers are unknown, contacts that lie nearly on a line give NaN.
-
-    Raises:
-        DegenerateContacts: the contacts lie nearly on a line.
+    axis is the normal of their plane. Contacts nearly on a line raise `DegenerateContacts`; inside torch.vmap, where
+    numbers are unknown, they give NaN.
     """
     flat = degenerate(points)
     if not is_known(flat):

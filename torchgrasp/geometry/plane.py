@@ -105,10 +105,7 @@ def upright_frame(
     The z axis is the table's normal. Without a table, z points to the camera; without both, z is the direction in which
     the points spread least. The x axis is horizontal and points towards the camera. If the camera is straight above, x
     points to the point farthest from the vertical through the points' centroid. The origin is on this vertical, on the
-    table if there is one.
-
-    Raises:
-        BadArgument: most points are below the table.
+    table if there is one. A table above most points is a `BadArgument`.
     """
     points = points.detach().cpu().double()
     centre = points.mean(0)

@@ -67,23 +67,10 @@ def find_table(
     return (bound(plane, points, on, eye) or Support(plane),)
 
 
-def fit_support(
-    points: Float[Tensor, "n 3"],
-    viewpoint: Float[Tensor, "3"] | None = None,
-    up: Float[Tensor, "3"] | None = None,
-    *,
-    seed: int = 0,
-) -> Plane:
-    """Return the plane that most plausibly supports objects. Arguments and errors are those of `find_supports`."""
-    return find_supports(points, viewpoint, up, seed=seed)[0].plane
-
-
 def find_supports(
     points: Float[Tensor, "n 3"],
     viewpoint: Float[Tensor, "3"] | None = None,
     up: Float[Tensor, "3"] | None = None,
-    *,
-    seed: int = 0,
     least_width: float = LEAST_WIDTH,
 ) -> tuple[Support, ...]:
     """Return the planes that support objects in a view, the most plausible first, each with the region that it covers.
@@ -100,7 +87,7 @@ def find_supports(
     sky = None if up is None else unit(check_tensor("up", up, (3,)).detach().cpu().double())
     if len(points) < 50:
         raise NoSupport("table", f"{len(points)} points", SUPPORT)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     points = points[torch.randperm(len(points), generator=generator, device="cpu")[:20_000]]
     centre = points.mean(0)
     points = points - centre  # so that distant origins cost no digits

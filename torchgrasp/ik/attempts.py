@@ -126,11 +126,6 @@ def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
     return torch.cat(costs)
 
 
-def rank_seeds(problem: GraspProblem, seeds: IKSeeds) -> Int[Tensor, "g"]:
-    """Return the rank of each seed among the seeds of its contact set; rank 0 has the least of the `seed_costs`."""
-    return rank_in_group(seeds.row, seed_costs(problem, seeds))
-
-
 @checked
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp on fixed contacts for each contact set with seeds, best grasp first.
@@ -139,7 +134,8 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
-    attempts.refine(seeds, rank_seeds(problem, seeds), (2, 4), partial(refine_on_contacts, problem))
+    rank = rank_in_group(seeds.row, seed_costs(problem, seeds))
+    attempts.refine(seeds, rank, (2, 4), partial(refine_on_contacts, problem))
     return best_first(best_grasps(attempts)[0])
 
 

@@ -3,14 +3,15 @@
 import dataclasses
 import math
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value, check_number, settle
-from torchgrasp.checks import checked
+from torchgrasp.base import Value, settle
+from torchgrasp.checks import Range, checked
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.collision_shapes import CollisionSpheres
@@ -48,7 +49,9 @@ class Obstacles(Value):
 
     @classmethod
     @checked
-    def of(cls, occupancy: Occupancy, full: float = 0.3, hard: bool = True) -> "Obstacles | None":
+    def of(
+        cls, occupancy: Occupancy, full: Annotated[float, Range(0.01, 1.0)] = 0.3, hard: bool = True
+    ) -> "Obstacles | None":
         """Return the obstacles of an occupancy grid, or None if all its voxels are probably free.
 
         Voxels of probability `full` or more count as occupied.
@@ -56,7 +59,6 @@ class Obstacles(Value):
         Raises:
             BadArgument: `full` outside [0.01, 1].
         """
-        check_number("full", full, 0.01, 1.0)
         device, occupancy = occupancy.origin.device, settle(occupancy, torch.device("cpu"))  # SciPy's distances
         probability, levels = occupancy.probability, sorted({0.1, 0.5, 0.8, full})
         if not bool((probability >= levels[0]).any()):

@@ -6,7 +6,6 @@
 
 import dataclasses
 import functools
-import itertools
 import json
 import math
 from pathlib import Path
@@ -17,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.geometry.frames import apply, inverse, rotate, skew
+from torchgrasp.geometry.frames import apply, inverse, rotate, skew, subsets
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.closure import cone_edges, tangents
@@ -80,7 +79,7 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
     than three contacts, the triangle of the smallest ratio counts.
     """
     if points.shape[1] > 3:
-        triples = torch.tensor(list(itertools.combinations(range(points.shape[1]), 3)), device=points.device)
+        triples = subsets(points.shape[1], 3, points.device)
         return load_arm(points[:, triples].flatten(0, 1), center).unflatten(0, (len(points), len(triples))).amin(1)
     sides = points.roll(-1, dims=1) - points
     longest = torch.linalg.vector_norm(sides, dim=-1).argmax(1)[:, None, None].expand(-1, 1, 3)

@@ -10,12 +10,11 @@ from PIL import Image
 
 from torchgrasp import load_scene
 from torchgrasp.app.report import draw_scene
-from torchgrasp.app.report.canvas import SIZE, rgb
+from torchgrasp.app.report.canvas import OBJECTS, SIZE, rgb
 from torchgrasp.app.report.page import draw_pictures
 from torchgrasp.app.report.scene import KINDS, encode_scene, sort_pixels
 from torchgrasp.app.report.solids import PARKED, finger_of_links, solids_from_hand
 from torchgrasp.app.report.stills import (
-    OBJECTS,
     draw_among,
     draw_cloud,
     draw_contacts,
@@ -73,9 +72,9 @@ def test_neighbours_are_drawn_and_the_target_is_not_drawn_twice(run, scene):
 
 
 def test_a_run_in_a_scene_shows_it_first(run, scene, monkeypatch):
-    for name in ("draw_cloud", "draw_surface", "draw_contacts", "draw_grasp", "draw_film"):
-        monkeypatch.setattr(f"torchgrasp.app.report.page.{name}", lambda *a: b"")
-    monkeypatch.setattr("torchgrasp.app.report.page.draw_among", lambda *a: b"")
+    for name in ("draw_cloud", "draw_surface", "draw_contacts", "draw_grasp", "draw_among"):
+        monkeypatch.setattr(f"torchgrasp.app.report.stills.{name}", lambda *a: b"")
+    monkeypatch.setattr("torchgrasp.app.report.page.draw_film", lambda *a: b"")
     sections = draw_pictures(dataclasses.replace(run, scene=scene))
     assert next(iter(sections)) == "The scene" and len(sections["The scene"]) == 2
     assert "The scene" not in draw_pictures(run)

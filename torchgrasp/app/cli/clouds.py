@@ -5,16 +5,8 @@ from typing import Annotated, Literal
 
 import torch
 
+from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import Command, arguments, naming, nested, option, positional, required
-from torchgrasp.app.cli.inputs import (
-    CLOUD_HELP,
-    OUT_CLOUD_HELP,
-    SEED_HELP,
-    CloudOptions,
-    ViewOptions,
-    find_cloud,
-    print_notes,
-)
 from torchgrasp.checks import Range, Seed, check_tensor
 from torchgrasp.cloud import (
     cut_object,
@@ -43,12 +35,12 @@ from torchgrasp.values import PointCloud
 class CloudCheck(Command):
     """Report on a point cloud, with advice for a better one. The exit code is 1 if `torchgrasp grasp` refuses it."""
 
-    file: Path = positional(CLOUD_HELP)
-    view: CloudOptions = nested(CloudOptions())
+    file: Path = positional(inputs.CLOUD_HELP)
+    view: inputs.CloudOptions = nested(inputs.CloudOptions())
 
     def run(self) -> int:
         """Check the cloud and print the report; return the exit code."""
-        file = self.view.read("FILE", find_cloud(self.file, "FILE"), whole=True)
+        file = self.view.read("FILE", inputs.find_cloud(self.file, "FILE"), whole=True)
         view = self.view.with_table_of(file)
         plane = as_plane(view.plane(file.cloud))
         up = view.given_vertical(plane)
@@ -81,8 +73,8 @@ class CloudCut(Command):
     """Write the points of one object in a scene, without the points of the table, and the plane of the table."""
 
     cloud: Path = positional("point cloud of a scene of any size (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv)")
-    out: Path = required(OUT_CLOUD_HELP)
-    view: ViewOptions = nested(ViewOptions())
+    out: Path = required(inputs.OUT_CLOUD_HELP)
+    view: inputs.ViewOptions = nested(inputs.ViewOptions())
     point: tuple[float, float, float] | None = option(
         None, "a point on or near the object; points farther than 0.5 m away are left out. By default the largest"
     )
@@ -100,7 +92,7 @@ class CloudCut(Command):
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if up is None else up
         thing, plane = cut_object(file.cloud, up, near, None if corners is None else corners.reshape(2, 3), self.gap)
         save_cloud(thing, self.out, plane)
-        print_notes(file.notes)
+        inputs.print_notes(file.notes)
         if plane is None:
             print("note    no plane was found under the object")
         else:
@@ -114,10 +106,10 @@ class CloudCut(Command):
 class CloudThin(Command):
     """Write one point per voxel, without outliers such as flying pixels."""
 
-    cloud: Path = positional(CLOUD_HELP)
-    out: Path = required(OUT_CLOUD_HELP)
+    cloud: Path = positional(inputs.CLOUD_HELP)
+    out: Path = required(inputs.OUT_CLOUD_HELP)
     voxel: float = option(0.002, "side of a voxel [m]")
-    view: ViewOptions = nested(ViewOptions())
+    view: inputs.ViewOptions = nested(inputs.ViewOptions())
 
     def run(self) -> int:
         """Thin the cloud, remove outliers and write the rest; return the exit code."""
@@ -125,7 +117,7 @@ class CloudThin(Command):
         some = voxel_downsample(file.cloud, self.voxel)
         less = remove_outliers(some)
         save_cloud(less, self.out, file.table)
-        print_notes(file.notes)
+        inputs.print_notes(file.notes)
         print(f"{len(less)} of {len(file.cloud)} points, {len(some) - len(less)} outliers removed, {self.out}")
         return 0
 
@@ -135,13 +127,13 @@ class CloudRender(Command):
     """Write the point cloud that a depth camera sees of a mesh."""
 
     mesh: Path = positional("closed mesh of an object [m], z up (.ply, .obj, .stl, ...)")
-    out: Path = required(f"{OUT_CLOUD_HELP}, with the viewpoint")
+    out: Path = required(f"{inputs.OUT_CLOUD_HELP}, with the viewpoint")
     azimuth: float = option(30.0, "direction of the camera from the mesh, from x towards y [degrees]")
     elevation: float = option(30.0, "elevation of the camera above the horizontal [degrees]")
     distance: float = option(0.5, "distance of the camera from the centre of the mesh [m]")
     points: int = option(1000, "number of points; fewer if fewer pixels see the object")
     no_noise: bool = option(False, "an exact camera instead of an active stereo camera")
-    seed: Seed = option(0, SEED_HELP)
+    seed: Seed = option(0, inputs.SEED_HELP)
 
     def run(self) -> int:
         """Render the mesh by a simulated depth camera and write the cloud; return the exit code."""
@@ -162,7 +154,7 @@ class CloudViews(Command):
     meshes: Path = positional("folder of closed meshes [m], z up (.ply, .stl, .obj, .off)")
     out: Path = required("folder to write: manifest.json, and for each object mesh.ply and its views")
     views: Annotated[int, Range(1, 1000)] = option(3, "views of each object, from random sides")
-    seed: Seed = option(0, SEED_HELP)
+    seed: Seed = option(0, inputs.SEED_HELP)
 
     def run(self) -> int:
         """Render views of all meshes and write the folder of objects; return the exit code."""
@@ -175,25 +167,25 @@ class CloudViews(Command):
 class ShapeSurface(Command):
     """Write the estimated surface of an object, coloured by its standard deviation."""
 
-    cloud: Path = positional(CLOUD_HELP)
+    cloud: Path = positional(inputs.CLOUD_HELP)
     out: Path = required('mesh to write: .ply, with the standard deviation of each vertex as "std_m" [m], or .glb')
-    view: CloudOptions = nested(CloudOptions())
+    view: inputs.CloudOptions = nested(inputs.CloudOptions())
     support: Literal["camera", "paper"] = option(
         "camera", "observations of the hidden side: from the camera, or the paper's points"
     )
     resolution: int = option(64, "cells along the diameter of the surface's domain, 8 to 256")
-    seed: Seed = option(0, SEED_HELP)
+    seed: Seed = option(0, inputs.SEED_HELP)
 
     def run(self) -> int:
         """Fit the shape and write its surface as a mesh; return the exit code."""
         check_surface_path(self.out)
-        file = self.view.read("CLOUD", find_cloud(self.cloud))
+        file = self.view.read("CLOUD", inputs.find_cloud(self.cloud))
         table = self.view.with_table_of(file).plane(file.cloud)
         with naming(table="--table"):
             shape = fit_shape(file.cloud, support=self.support, seed=self.seed, table=table)
         estimate = extract_surface(shape, self.resolution)
         save_surface(estimate, self.out)
-        print_notes(file.notes)
+        inputs.print_notes(file.notes)
         middle, most = 1e3 * float(estimate.std_m.median()), 1e3 * largest_std(estimate)
         print(f"{len(estimate.vertices)} vertices, {len(estimate.faces)} faces, {self.out}")
         print(f"standard deviation: median {middle:.1f} mm, {most:.1f} mm where it is yellow")

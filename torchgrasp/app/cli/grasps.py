@@ -5,22 +5,8 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import Command, Progress, arguments, naming, nested, option, positional
-from torchgrasp.app.cli.inputs import (
-    CLOUD_HELP,
-    FINGERS_HELP,
-    HAND_HELP,
-    STARTS_HELP,
-    CloudOptions,
-    check_folder,
-    describe_table,
-    find_cloud,
-    holding,
-    import_simulator,
-    load_fingers,
-    object_name,
-    print_notes,
-)
 from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, write_report
 from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.viewer import VIEW, write_viewer
@@ -65,24 +51,24 @@ class Grasp(Command):
     """
 
     cloud: Path = positional(
-        f"{CLOUD_HELP}, a scene (.npz with depth and intrinsics; see docs/real_camera.md), or the name of a shipped "
-        "object, as jug"
+        f"{inputs.CLOUD_HELP}, a scene (.npz with depth and intrinsics; see docs/real_camera.md), or the name of a "
+        "shipped object, as jug"
     )
-    hand: str = option("allegro", HAND_HELP)
+    hand: str = option("allegro", inputs.HAND_HELP)
     out: Path | None = option(None, "folder of the results; by default out/ and the name of the object")
     mesh: Path | None = option(
         None, "true mesh of the object [m] in the frame of the cloud, for the simulator; a shipped object has one"
     )
     close: bool = option(False, 'close the best grasp on the mesh, lift it and hold it (needs the extra "sim")')
     seed: Seed = option(0, "random seed; the same seed gives the same grasps")
-    starts: Count = option(1000, STARTS_HELP)
+    starts: Count = option(1000, inputs.STARTS_HELP)
     time_budget: float | None = option(
         None, "seconds for planning; the batch that ends after them is the last. By default there is no limit"
     )
-    view: CloudOptions = nested(CloudOptions())
+    view: inputs.CloudOptions = nested(inputs.CloudOptions())
     friction: float = option(0.8, "coefficient of friction between fingertips and object")
     fingers: str = option(
-        "default", f'{FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely to succeed'
+        "default", f'{inputs.FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely to succeed'
     )
     mode: Mode = option(
         "joint", "contacts, pose and joints together; contacts first, then the learned model; or the paper as written"
@@ -93,12 +79,12 @@ class Grasp(Command):
 
     def run(self) -> int:
         """Plan grasps, close on the object if asked, and write the results; return the exit code."""
-        path = find_cloud(self.cloud)
-        out = Path("out") / object_name(path) if self.out is None else self.out
-        check_folder(out)
+        path = inputs.find_cloud(self.cloud)
+        out = Path("out") / inputs.object_name(path) if self.out is None else self.out
+        inputs.check_folder(out)
         scene = is_scene(path)
         self._check_choice(scene)
-        hand, among = load_fingers(self.hand, self.fingers)
+        hand, among = inputs.load_fingers(self.hand, self.fingers)
         return self._grasp_scene(path, out, hand, among) if scene else self._grasp_cloud(path, out, hand, among)
 
     def _check_choice(self, scene: bool) -> None:
@@ -106,7 +92,7 @@ class Grasp(Command):
         if scene:
             if self.label is not None and self.point is not None:
                 raise BadArgument("--point", "--label beside it", "one of the two")
-            other = vars(self.view) | {"table": None, "up": None} != vars(CloudOptions())
+            other = vars(self.view) | {"table": None, "up": None} != vars(inputs.CloudOptions())
             if self.mesh or other or self.mode != "joint" or self.time_budget:
                 options = "--label or --point, --table, --up, --hand, --fingers, --out, --seed, --starts, --friction"
                 raise BadArgument("CLOUD", "an option of clouds beside a scene", options)
@@ -125,7 +111,7 @@ class Grasp(Command):
         plane = as_plane(table)
         spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(friction=self.friction, table=table)
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
-        print_notes(file.notes, view.judge(cloud, table))
+        inputs.print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
             check_mesh(cloud, true_mesh, "--mesh")
             if plane is not None and view.table is None:  # the robot guesses its height, which the true mesh tells
@@ -133,8 +119,8 @@ class Grasp(Command):
             elif plane is not None:
                 check_stand(true_mesh, plane, "--mesh")
         progress = Progress(*["fingers"] * (among is not None), *STAGES, *["closing"] * self.close, "report")
-        with progress.bar, holding("--out", out):
-            origin = "no table" if table is None else describe_table(table)
+        with progress.bar, inputs.holding("--out", out):
+            origin = "no table" if table is None else inputs.describe_table(table)
             origin += " (lowest point)" * (table is not None and view.table is None)
             camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
             progress.end("cloud", f"{len(cloud)} points, {camera}, {origin}")
@@ -143,7 +129,7 @@ class Grasp(Command):
             explanation = None
             if not bool((grasps.status == Status.OK).any()):
                 explanation = explain_empty(cloud, hand, spec, self.starts, self.seed, **options)
-            hand, name = hand_of(grasps, hand), object_name(path if mesh is None else mesh)
+            hand, name = hand_of(grasps, hand), inputs.object_name(path if mesh is None else mesh)
             surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
             stages = tuple(progress.stages)
             run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, explanation=explanation)
@@ -165,7 +151,7 @@ class Grasp(Command):
         if self.close:
             if mesh is None:
                 raise BadArgument("--close", "no --mesh", "--close together with --mesh")
-            import_simulator()
+            inputs.import_simulator()
         return mesh
 
     def _grasp_scene(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
@@ -178,7 +164,7 @@ class Grasp(Command):
             scene = self._with_table(scene, choice is not None)
             scene = scene if choice is None else scene.select(choice)
         progress = Progress("scene", *["fingers"] * (among is not None), *STAGES, "report")
-        with progress.bar, holding("--out", out):
+        with progress.bar, inputs.holding("--out", out):
             progress.end("scene", f"{len(scene.things)} objects, labels {', '.join(map(str, scene.things))}")
             judged = Status.OK if scene.target is None else judge_things(scene, hand, spec)[scene.target]
             for sentence in (*scene.advice, *([judged.sentence] if judged is not Status.OK else [])):
@@ -219,7 +205,7 @@ class Grasp(Command):
             raise BadArgument(name, f"a table ({planes[0].describe()}) with which {lost} is lost", wanted)
         old, new, given = set(scene.things), set(again.things), set(scene.given)
         said = {"kept, but for pixels of the table": new & given, "found again": new - given, "lost": old - new}
-        print_notes(tuple(f"objects {how}: {str(sorted(some))[1:-1]}" for how, some in said.items() if some))
+        inputs.print_notes(tuple(f"objects {how}: {str(sorted(some))[1:-1]}" for how, some in said.items() if some))
         return again
 
     def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):

@@ -5,18 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchgrasp.app.report.canvas import (
-    ALARM,
-    FINGERS,
-    GRID,
-    INK,
-    OBJECT,
-    PAPER,
-    Canvas,
-    Direction,
-    encode_figure,
-    frame_camera,
-)
+from torchgrasp.app.report import canvas as paint
+from torchgrasp.app.report.canvas import Direction
 from torchgrasp.app.report.run import explain_loss, first_touches, moments_of
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import add_solids, to_array
@@ -41,7 +31,7 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
     plots, time, count = _list_plots(mesh, hand, closure), to_array(closure.time), len(moments)
     heights = [200 if title.endswith(":") else 110 for title, *_ in plots]
     height = STILL + sum(heights) + 50 * len(plots) + 76
-    figure = Figure((WIDTH / 100, height / 100), dpi=100, facecolor=PAPER)
+    figure = Figure((WIDTH / 100, height / 100), dpi=100, facecolor=paint.PAPER)
     stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction, (WIDTH // count, STILL - TITLE))
     for k, (still, moment) in enumerate(zip(stills, moments, strict=True)):
         axis = figure.add_axes((k / count, 1 - STILL / height, 1 / count, (STILL - TITLE) / height))
@@ -55,15 +45,15 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
     for axis, plot in zip(axes, plots, strict=True):
         _draw_plot(axis, time, *plot)
     for finger, tick in zip(closure.contact_order, first_touches(closure), strict=True):
-        axes[0].plot(time[tick], 0.0, "^", color=FINGERS[finger], markersize=12, clip_on=False, zorder=3)
+        axes[0].plot(time[tick], 0.0, "^", color=paint.FINGERS[finger], markersize=12, clip_on=False, zorder=3)
     for letter, moment in zip(LETTERS, moments, strict=False):
         at, color = float(closure.time[moment.tick]), moment.color
         for axis in axes:
-            axis.axvline(at, color=color, linewidth=2 if color == ALARM else 1, clip_on=False)
+            axis.axvline(at, color=color, linewidth=2 if color == paint.ALARM else 1, clip_on=False)
         place = {"xy": (at, 1.0), "xycoords": axes[0].get_xaxis_transform(), "ha": "center"}
         axes[0].annotate(letter, xytext=(0, 30), textcoords="offset points", color=color, fontsize=14, **place)
-    axes[-1].set_xlabel("time [s]", fontsize=13, color=INK)
-    return encode_figure(figure)
+    axes[-1].set_xlabel("time [s]", fontsize=13, color=paint.INK)
+    return paint.encode_figure(figure)
 
 
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
@@ -107,22 +97,22 @@ def _draw_stills(
     seen = np.concatenate([*near, *(s.vertices - b for solids, b in zip(hands, base, strict=True) for s in solids)])
     pictures = []
     for place, solids, b in zip(places, hands, base, strict=True):
-        canvas = Canvas()
-        canvas.add_mesh(place, faces, OBJECT)
+        canvas = paint.Canvas()
+        canvas.add_mesh(place, faces, paint.OBJECT)
         add_solids(canvas, solids)
         canvas.add_table(seen + b, table)
-        pictures.append(canvas.render(frame_camera(seen + b, direction, size=size), size))
+        pictures.append(canvas.render(paint.frame_camera(seen + b, direction, size=size), size))
     return pictures
 
 
 def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[Any]) -> None:
     """Draw lines over time in one plot from 0 to `top`, with a legend if the title ends with a colon."""
-    axis.set(xlim=(time[0], max(time[-1], time[0] + 0.1)), ylim=(0.0, top), facecolor=PAPER)
-    axis.set_title(title, loc="left", color=INK, fontsize=13, pad=9)
-    axis.grid(axis="y", color=GRID)
+    axis.set(xlim=(time[0], max(time[-1], time[0] + 0.1)), ylim=(0.0, top), facecolor=paint.PAPER)
+    axis.set_title(title, loc="left", color=paint.INK, fontsize=13, pad=9)
+    axis.grid(axis="y", color=paint.GRID)
     axis.locator_params(axis="y", nbins=3)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=13, labelcolor=INK, color=INK)
+    axis.tick_params(labelsize=13, labelcolor=paint.INK, color=paint.INK)
     for values, color, label in lines:
         wide = 4.0 if label == "hand above its lowest" else 1.8  # a held object would cover this line
         axis.plot(time, values, color=color, label=label, linewidth=wide)
@@ -145,7 +135,7 @@ def _list_plots(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> 
     forces, blend, sliding = to_array(closure.forces), to_array(trace.blend), 1e3 * to_array(trace.sliding)
 
     def of_fingers(values: np.ndarray) -> list[Any]:
-        return list(zip(values.T, FINGERS, ranks, strict=False))
+        return list(zip(values.T, paint.FINGERS, ranks, strict=False))
 
     return [
         ("normal force [N], in the order of touch:", max(1.0, 1.1 * float(np.nanmax(forces))), of_fingers(forces)),

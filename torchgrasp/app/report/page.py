@@ -6,20 +6,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchgrasp.app.report import stills
 from torchgrasp.app.report.canvas import FINGERS
 from torchgrasp.app.report.film import describe_film, draw_film
 from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.scene import encode_scene
-from torchgrasp.app.report.stills import (
-    draw_among,
-    draw_cloud,
-    draw_contacts,
-    draw_grasp,
-    draw_surface,
-    facing,
-    rotated,
-    view_of,
-)
 from torchgrasp.base import count_status
 from torchgrasp.checks import checked
 from torchgrasp.files import write_file
@@ -66,29 +57,31 @@ def draw_pictures(run: Run) -> Sections:
     """Draw all pictures of a run; return captions and PNGs by section."""
     run = run.upright()
     table = None if run.spec.table is None else 0.0
-    view, best = view_of(run.cloud), run.executable
+    view, best = stills.view_of(run.cloud), run.executable
+    behind = stills.rotated(view, 180.0)
     sections = {
         "Seen and unseen": [
-            ("The cloud from the camera's side, coloured by height.", draw_cloud(run.cloud, table)),
-            ("The estimated surface from the camera's side.", draw_surface(run.surface, view, table)),
-            ("The same from behind, where nothing was seen.", draw_surface(run.surface, rotated(view, 180.0), table)),
+            ("The cloud from the camera's side, coloured by height.", stills.draw_cloud(run.cloud, table)),
+            ("The estimated surface from the camera's side.", stills.draw_surface(run.surface, view, table)),
+            ("The same from behind, where nothing was seen.", stills.draw_surface(run.surface, behind, table)),
         ]
     }
     if run.scene is not None:
         seen = [("What was found in the depth image; the target has a white rim.", encode_scene(run.scene))]
         if len(best):
-            among = draw_among(run.scene, run.surface, run.hand, best[0], view)
+            among = stills.draw_among(run.scene, run.surface, run.hand, best[0], view)
             seen.append(("The best grasp among the measured points of the other objects.", among))
         sections = {"The scene": seen, **sections}
     if len(best):
-        front = facing(best)
+        front = stills.facing(best)
+        aside = stills.rotated(front, 60.0)
         sections["The best grasp"] = [
-            ("Contacts with outward normals.", draw_contacts(run.surface, best.contacts[0], front, table)),
-            ("The hand on the estimated surface.", draw_grasp(run.surface, run.hand, best[0], front, table)),
-            ("The same from another side.", draw_grasp(run.surface, run.hand, best[0], rotated(front, 60.0), table)),
+            ("Contacts with outward normals.", stills.draw_contacts(run.surface, best.contacts[0], front, table)),
+            ("The hand on the estimated surface.", stills.draw_grasp(run.surface, run.hand, best[0], front, table)),
+            ("The same from another side.", stills.draw_grasp(run.surface, run.hand, best[0], aside, table)),
         ]
     if run.closure is not None and run.mesh is not None:
-        side = rotated(facing(best), 20.0) if len(best) else view
+        side = stills.rotated(stills.facing(best), 20.0) if len(best) else view
         sections["Closing on the true object"] = [
             (describe_film(run.mesh, run.hand, run.closure), draw_film(run.mesh, run.hand, run.closure, side))
         ]

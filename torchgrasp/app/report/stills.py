@@ -7,22 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.app.report.canvas import (
-    AXES,
-    FINGERS,
-    GRID,
-    HAND,
-    INK,
-    OBJECT,
-    OBJECTS,
-    PAPER,
-    TABLE,
-    Canvas,
-    Direction,
-    encode_figure,
-    map_colors,
-    rgb,
-)
+from torchgrasp.app.report import canvas as paint
+from torchgrasp.app.report.canvas import Direction
 from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
@@ -35,8 +21,8 @@ def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
     """Return a PNG of a cloud from its camera, coloured by height; `table` is the height [m] of the table."""
     points = _thinned(to_array(cloud.points), 3000)
     height = points[:, 2] - points[:, 2].min()
-    canvas = Canvas()
-    canvas.add_points(points, map_colors(height / max(float(height.max()), 1e-12), "cividis"))
+    canvas = paint.Canvas()
+    canvas.add_points(points, paint.map_colors(height / max(float(height.max()), 1e-12), "cividis"))
     canvas.add_table(points, table)
     return canvas.render_png(points, view_of(cloud))
 
@@ -45,8 +31,8 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
     """Return a PNG of the estimated surface seen from `direction`, coloured by its standard deviation [mm]."""
     vertices, std_mm = to_array(surface.vertices), 1e3 * to_array(surface.std_m)
     most = max(float(np.quantile(std_mm, 0.99)), 1e-3)
-    canvas = Canvas()
-    faces, colors = surface.faces.cpu().numpy(), map_colors(std_mm / most, "viridis")
+    canvas = paint.Canvas()
+    faces, colors = surface.faces.cpu().numpy(), paint.map_colors(std_mm / most, "viridis")
     canvas.add_mesh(vertices, faces, colors, to_array(surface.normals))
     canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction, bar=("standard deviation of the surface [mm]", most, "viridis"))
@@ -55,8 +41,8 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
 def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:
     """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface."""
     vertices = to_array(surface.vertices)
-    canvas = Canvas()
-    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals), transparent=True)
+    canvas = paint.Canvas()
+    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), paint.OBJECT, to_array(surface.normals), transparent=True)
     _add_contacts(canvas, contacts)
     canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction)
@@ -93,23 +79,23 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
         ("every joint at its lower limit", hand.lower.to(joints), eye),
         ("every joint at its upper limit", hand.upper.to(joints), eye),
     ]
-    figure = Figure((13.5, 10.8 + bars), dpi=100, facecolor=PAPER, layout="constrained")
+    figure = Figure((13.5, 10.8 + bars), dpi=100, facecolor=paint.PAPER, layout="constrained")
     stills, ranges = figure.subfigures(2, 1, squeeze=False, height_ratios=(10.8, bars)).flat
     for axis, (title, posture, direction) in zip(stills.subplots(2, 2).flat, views, strict=True):
         axis.imshow(Image.open(io.BytesIO(draw_posture(hand, posture, direction))))
-        axis.set_title(title, loc="left", color=INK, fontsize=14)
+        axis.set_title(title, loc="left", color=paint.INK, fontsize=14)
         axis.set_axis_off()
     low, high, at = (np.rad2deg(to_array(x)) for x in (hand.lower, hand.upper, joints))
     axis = ranges.subplots()
     axis.barh(hand.joint_names, high - low, 0.4, low, color=_joint_colors(hand))
-    axis.plot(at, hand.joint_names, "|", color=INK, markersize=16, markeredgewidth=3)
-    axis.set_xlabel("ranges of the joints [degrees], the posture as a mark", color=INK)
+    axis.plot(at, hand.joint_names, "|", color=paint.INK, markersize=16, markeredgewidth=3)
+    axis.set_xlabel("ranges of the joints [degrees], the posture as a mark", color=paint.INK)
     axis.invert_yaxis()
-    axis.grid(axis="x", color=GRID)
+    axis.grid(axis="x", color=paint.GRID)
     axis.margins(x=0.02)
-    axis.set(axisbelow=True, facecolor=PAPER)
+    axis.set(axisbelow=True, facecolor=paint.PAPER)
     axis.spines[:].set_visible(False)
-    return encode_figure(figure)
+    return paint.encode_figure(figure)
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
@@ -117,10 +103,10 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
     solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints))
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
     arrow, axis = 0.03, 0.6 * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
-    canvas = Canvas()
+    canvas = paint.Canvas()
     add_solids(canvas, solids)
-    canvas.add_arrows(points[0], normals[0], arrow, FINGERS[: len(hand.tips)])
-    canvas.add_arrows(np.zeros((3, 3)), np.eye(3), axis, AXES)
+    canvas.add_arrows(points[0], normals[0], arrow, paint.FINGERS[: len(hand.tips)])
+    canvas.add_arrows(np.zeros((3, 3)), np.eye(3), axis, paint.AXES)
     corners = [points[0], points[0] + arrow * normals[0], axis * np.eye(3), *(s.vertices for s in solids)]
     return canvas.render_png(np.concatenate(corners), eye)
 
@@ -164,24 +150,24 @@ def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
     return value.detach().cpu().double().numpy()
 
 
-def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[Canvas, Float[np.ndarray, "n 3"]]:
+def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[paint.Canvas, Float[np.ndarray, "n 3"]]:
     """Return a canvas with the surface and the first grasp's hand and contacts, and the points that must be in view."""
     joints, vertices = hand.expand_joints(grasp.joints[0].double()), to_array(surface.vertices)
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
-    canvas = Canvas()
-    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), OBJECT, to_array(surface.normals))
+    canvas = paint.Canvas()
+    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), paint.OBJECT, to_array(surface.normals))
     _add_contacts(canvas, grasp.contacts)
     add_solids(canvas, solids)
     return canvas, np.concatenate([vertices, *(s.vertices for s in solids)])
 
 
-def _add_contacts(canvas: Canvas, contacts: Contacts) -> None:
+def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> None:
     """Add an arrow along the normal of each contact of the first grasp, in the colour of its finger."""
     points, normals = to_array(contacts.points[0]), to_array(contacts.normals[0])
-    canvas.add_arrows(points, normals, 0.045, FINGERS[: len(points)])
+    canvas.add_arrows(points, normals, 0.045, paint.FINGERS[: len(points)])
 
 
-def add_solids(canvas: Canvas, solids: list[Solid]) -> None:
+def add_solids(canvas: paint.Canvas, solids: list[Solid]) -> None:
     """Add the links of a hand to a canvas."""
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
@@ -192,13 +178,14 @@ def _joint_colors(hand: Hand) -> list[str]:
     finger_of_link = finger_of_links(hand)
     finger_of_joint = [finger_of_link[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
     moved = [{finger_of_joint[j] for j in torch.nonzero(row)[:, 0].tolist()} for row in hand.actuated.coupling.T]
-    return [HAND if len(fingers) != 1 or fingers == {PARKED} else FINGERS[fingers.pop()] for fingers in moved]
+    colors = {PARKED: paint.HAND, **dict(enumerate(paint.FINGERS))}
+    return [colors[min(fingers)] if len(fingers) == 1 else paint.HAND for fingers in moved]
 
 
 def _label_colors(labels: np.ndarray) -> Float[np.ndarray, "*b 3"]:
     """Return the colour of the object with each label; label 0 gives the table's colour."""
-    palette = np.stack([rgb(name) for name in (TABLE, *OBJECTS)])
-    return palette[np.where(labels > 0, 1 + (labels - 1) % len(OBJECTS), 0)]
+    palette = np.stack([paint.rgb(name) for name in (paint.TABLE, *paint.OBJECTS)])
+    return palette[np.where(labels > 0, 1 + (labels - 1) % len(paint.OBJECTS), 0)]
 
 
 def _thinned(rows: np.ndarray, most: int) -> np.ndarray:
