@@ -69,7 +69,7 @@ def test_grasp_check_without_places_judges_by_touch_and_accepts_the_last_attempt
 
 def test_reopening_opens_before_the_palm_moves():
     start, shift = torch.full((9,), 0.1).double(), real([0.01, 0.005, -0.01])
-    opening = Reopening(on_table(), torch.cat([shift, STILL]), start, STILL, 0.02)
+    opening = Reopening(on_table(), torch.cat([shift, STILL]), start, STILL, STILL, 0.02)
     goal, palms, ticks = shift * real([1, 0, 1]), [STILL], 0  # along the table
     while not opening.done:
         joints, ticks = opening(PERIOD), ticks + 1
@@ -84,10 +84,31 @@ def test_reopening_opens_before_the_palm_moves():
 
 @pytest.mark.parametrize(("reach", "length"), [(0.02, 0.02), (0.0, 0.0)])
 def test_reopening_keeps_the_palm_within_its_reach(reach, length):
-    opening = Reopening(on_table(), torch.cat([real([0.03, 0, 0.04]), STILL]), torch.zeros(9).double(), STILL, reach)
+    far, joints = torch.cat([real([0.03, 0, 0.04]), STILL]), torch.zeros(9).double()
+    opening = Reopening(on_table(), far, joints, STILL, STILL, reach)
     while not opening.done:
         opening(PERIOD)
     assert abs(float(opening.palm.norm()) - length) < 1e-12
+
+
+def test_reopening_takes_fingers_and_palm_back_at_the_same_time():
+    start, begun, closed = torch.full((9,), 0.1).double(), real([0.02, 0, 0]), real([0.01, 0, 0.01])
+    opening = Reopening(on_table(), PLACE, start, closed, begun, 0.0)
+    while not opening.done:
+        joints = opening(PERIOD)
+        share = (joints - start) / (opening.opened - start)
+        assert torch.allclose(opening.palm, closed + share[:3] * (begun - closed), rtol=0, atol=1e-12)
+    assert torch.equal(joints, opening.opened) and torch.equal(opening.palm, begun)
+
+
+def test_only_a_hand_whose_fingers_have_all_touched_presses_before_it_is_judged():
+    for missing in (None, 1):
+        controller, contact = GraspController(on_table()), TOUCHING if missing is None else torch.arange(3) != missing
+        seen, targets = observation(0.0, (0.3 * contact.double()).tolist(), contact), []
+        while controller.reopening is None and len(targets) < 1000:
+            joints = controller.step(seen, PERIOD).joints
+            targets += [joints] if controller.hold is not None else []
+        assert torch.stack(targets).diff(dim=0).any() == (missing is None)
 
 
 def close(controller: GraspController, seen) -> int:

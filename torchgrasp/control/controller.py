@@ -195,6 +195,9 @@ class GraspController:
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is not None:
             self.pressed += period
+            missed = isinstance(self.closing, UncertaintyClosing) and not bool(self.closing.touched.all())
+            if missed and self.check is not None and not self.check.judged:
+                return self.targets.joints  # without a finger that opposes them, pressing ones push the object away
             return self.hold(observation, period)
         if not over or isinstance(self.closing, OpenLoopClosing):
             self.time += period
@@ -218,8 +221,9 @@ class GraspController:
             return
         self.check(observation, self.pressed)
         if self.check.judged and not self.check.secure:
-            reach, joints = 0.0 if self.length else self.options.palm_reach, self.targets.joints
-            self.reopening = Reopening(self.reference, self.check.displacement, joints, self.closing.palm, reach)
+            assert isinstance(self.closing, UncertaintyClosing)
+            reach, palms = 0.0 if self.length else self.options.palm_reach, (self.closing.palm, self.closing.begun)
+            self.reopening = Reopening(self.reference, self.check.displacement, observation.joints, *palms, reach)
             self.hold, self.check, self.pressed = None, None, 0.0
 
     def _reopen(self, reopening: Reopening, period: float) -> Targets:

@@ -42,9 +42,10 @@ def can_guard(reference: ClosingReference) -> bool:
 class GuardedApproach:
     """Move the opened hand to its pre-grasp, `length` [m] away, and stop it when a finger touches (guarded move).
 
-    Fingertips sense a touch, and other links are felt by the drives of their joints. After a stop the hand averages its
-    touch readings, locates the object, retreats, moves its palm sideways and goes on. After the last allowed stop the
-    hand ignores touches. A hand that has been reopened (`after`) starts at its pre-grasp, and retreats first.
+    Fingertips sense a touch, and other links are felt by the drives of their joints. At a touch the hand draws back at
+    once, so that it pushes the object little. It averages its touch readings, locates the object, moves its palm
+    sideways and goes on. After the last allowed stop the hand ignores touches. A hand that has been reopened (`after`)
+    starts at its pre-grasp, and retreats first.
 
     `left` [m] is the remaining length of the approach, `palm` [m] the palm's displacement from its planned path,
     `stops` the number of stops. `displacement` holds the object's translation [m] and rotation [rad] at the last touch.
@@ -73,21 +74,22 @@ class GuardedApproach:
         """Update `left` and `palm` for the next tick, `period` [s] later."""
         if self.feeling:
             self._feel(observation, period)
-        elif self.left < self.retreat:
+        if self.left < self.retreat:
             self.speed = min(self.speed + ACCELERATION * period, SPEED)
             self.left = min(self.left + self.speed * period, self.retreat)
             if self.left >= self.retreat:
                 self.speed = self.retreat = 0.0
-        elif not torch.equal(self.palm, self.goal):
+        elif not self.feeling and not torch.equal(self.palm, self.goal):
             self.palm = next_palm(self.palm, self.goal, period)
-        else:
+        elif not self.feeling:
             self._advance(observation, period)
 
     def _advance(self, observation: Observation, period: float) -> None:
         """Move on towards the pre-grasp, or stop at a touch of a fingertip or of another link."""
         links = self._touching_links(observation)
         if self.stops < self.options.stops and (bool(observation.tactile.contact.any()) or len(links)):
-            self.speed, self.time, self.feeling = 0.0, 0.0, True
+            self.speed, self.time, self.feeling = CAREFUL_SPEED, 0.0, True
+            self.retreat = min(self.left + 0.02, self.length)
             self.touches = Touches(self.reference, links)
             self.search = Localization(self.reference, self.displacement[:3])
             self.touches.add(observation, self.palm - self.left * self.direction)
@@ -122,13 +124,13 @@ class GuardedApproach:
             self.feeling, self.careful, self.stops = False, True, self.stops + 1
             if self.search.done:
                 self._turn_to(self.search.displacement)
-            self.retreat = max(self.retreat, min(self.left + 0.02, self.length))
 
     def _turn_to(self, displacement: Float[Tensor, "6"]) -> None:
         """Let the palm follow a displacement of the object, after a retreat as far as the palm then moves."""
         self.displacement = displacement
         self.goal = palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
-        self.retreat = min(self.left + float(torch.linalg.vector_norm(self.goal - self.palm)), self.length)
+        way = float(torch.linalg.vector_norm(self.goal - self.palm))
+        self.retreat = max(self.retreat, min(self.left + way, self.length))
 
 
 class GraspCheck:
@@ -187,8 +189,9 @@ class GraspCheck:
 class Reopening:
     """Open the hand and move its palm to the displaced object; `done` says when the hand may close again.
 
-    `displacement` holds the object's translation [m] and rotation [rad], `joints` the hand's present joint targets
-    [rad]. The palm's displacement `palm` [m] changes to at most `reach` [m], and not at all if `reach` is 0.
+    The fingers leave the object at the same time, because their targets begin at the measured `joints` [rad]. Meanwhile
+    the palm returns from its displacement `palm` [m] to `begun` [m], where the open hand met nothing. Then it follows
+    the object's `displacement` [m, rad] to at most `reach` [m], or stays if `reach` is 0.
     """
 
     def __init__(
@@ -197,11 +200,12 @@ class Reopening:
         displacement: Float[Tensor, "6"],
         joints: Float[Tensor, " j"],
         palm: Float[Tensor, "3"],
+        begun: Float[Tensor, "3"],
         reach: float,
     ) -> None:
         self.displacement, self.start, self.opened = displacement, joints, reference.expand(reference.pregrasp)
-        self.palm, self.time = palm, 0.0
-        self.goal = palm_goal(displacement[:3], reference.table, reach) if reach else palm
+        self.palm, self.closed, self.begun, self.time = palm, palm, begun, 0.0
+        self.goal = palm_goal(displacement[:3], reference.table, reach) if reach else begun
 
     @property
     def done(self) -> bool:
@@ -210,11 +214,15 @@ class Reopening:
 
     def __call__(self, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints [rad] for the next tick: first the fingers open, then the palm moves."""
-        if self.time >= OPENING_TIME and not torch.equal(self.palm, self.goal):
-            self.palm = next_palm(self.palm, self.goal, period)
-        else:
+        opens = self.time < OPENING_TIME
+        if opens or torch.equal(self.palm, self.goal):
             self.time += period
-        return torch.lerp(self.start, self.opened, min(self.time / OPENING_TIME, 1.0))
+        else:
+            self.palm = next_palm(self.palm, self.goal, period)
+        share = min(self.time / OPENING_TIME, 1.0)
+        if opens:
+            self.palm = torch.lerp(self.closed, self.begun, share)
+        return torch.lerp(self.start, self.opened, share)
 
 
 class LiftCheck:

@@ -41,7 +41,8 @@ class UncertaintyClosing:
     def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:
         self.reference, self.waits, self.reach = reference, options.wait, options.palm_reach
         self.planes = ContactPlanes(reference) if options.pose_estimate else None
-        self.palm, self.displacement = STILL, torch.zeros(6, dtype=torch.float64)  # of palm [m] and object [m, rad]
+        self.begun = self.palm = STILL  # displacement [m] of the palm when the closing began, and now
+        self.displacement = torch.zeros(6, dtype=torch.float64)  # of the object [m, rad]
         self.touched = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
         self.alive, self.quick = reference.alive, reference.sensor.kind == "tactile" and reference.sensor.noise <= 1.0
         self.drives = None if bool(self.alive.all()) else DriveFeel(reference)
@@ -56,7 +57,7 @@ class UncertaintyClosing:
 
     def begin_at(self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]) -> "UncertaintyClosing":
         """Set the palm's initial displacement [m] and the object's expected displacement [m, rad]; return `self`."""
-        self.planes, self.palm = ContactPlanes(self.reference, displacement), palm
+        self.planes, self.palm, self.begun = ContactPlanes(self.reference, displacement), palm, palm
         self.displacement = displacement
         return self
 

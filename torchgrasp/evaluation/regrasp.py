@@ -111,8 +111,8 @@ class _CheckedLift(_Lift):
     def _put_down(self, time: float, rising: float) -> Status:
         """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift failed."""
         status, run, length = super()._put_down(time, rising), self.run, self.spec.approach
-        joints, palm, _ = run.controller.targets
-        opening = Reopening(run.robot.reference, torch.zeros(6, dtype=torch.float64), joints, palm, reach=0.0)
+        joints, palm, here = run.observation.joints, run.controller.targets.palm, torch.zeros(6, dtype=torch.float64)
+        opening = Reopening(run.robot.reference, here, joints, palm, palm, reach=0.0)
         while not opening.done:
             run.robot.tick(Targets(opening(run.robot.period), palm))
             self._record()
