@@ -47,7 +47,7 @@ def table_lift(o: Options) -> list[Row]:
     names = o.conditions or (*BARS, SIMULATORS)
     rows = list[Row]()
     for hand in map(load_hand, o.hands):
-        lift = functools.partial(_lift, o, hand)
+        lift = functools.cache(functools.partial(_lift, o, hand))  # one condition is a part of another
         for name in names:
             if name == SIMULATORS:
                 rows += _agree(hand.name, lift(BASE, "sapien", o.grasps), lift(BASE, "mujoco", o.grasps))
