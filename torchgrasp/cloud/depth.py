@@ -257,7 +257,7 @@ def _wrong_size(k: Float[Tensor, "3 3"], stated: list[float] | None, size: Seque
         if torch.equal(own, image) or (inside and bool((corner.abs() > 0.04 * own).any())):
             return None
         found = f"those of an image of {own[0]:g} x {own[1]:g} px for an image of {width} x {height}"
-    else:  # the principal point is about the middle of an image of a common size
+    else:  # the principal point tells the size of the image, roughly
         scales = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
         modes = ((320, 240), (424, 240), (480, 270), (512, 424), (640, 360), (640, 480), (640, 576), (848, 480))
         modes += ((960, 540), (1024, 768), (1280, 720), (1280, 960), (1920, 1080), (1944, 1200), (2048, 1536))

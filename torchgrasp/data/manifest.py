@@ -38,10 +38,10 @@ class ObjectEntry:
     """The description of an object in the manifest of a folder of objects."""
 
     views: dict[str, tuple[float, ...]]  # position [m] of the camera of each view by name, at scale 1
-    scale: float  # of mesh and clouds
-    family: str  # of similar objects; the object's own name by default
+    scale: float  # scale factor of mesh and clouds
+    family: str  # family of similar objects; the object's own name by default
     group: str  # such as "solid", "thin" or "shell"; "" by default
-    mass: float | None  # of the real object at any scale [kg], or None
+    mass: float | None  # mass [kg] of the real object at any scale, or None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
         """Return at most `most` names of views, sorted; with `whole`, only `WHOLE`, the view that shows all sides."""

@@ -102,9 +102,7 @@ class LinearResiduals(Linearisation):
 class LeastSquares(Problem[State, LinearResiduals]):
     """A batch of least-squares problems: the cost is the sum of squared residuals."""
 
-    residuals: Callable[
-        [State, Int[Tensor, "a"]], Residuals
-    ]  # residuals and Jacobian of the problems with given indices
+    residuals: Callable[[State, Int[Tensor, "a"]], Residuals]  # with Jacobian, of the problems with given indices
     moved: Callable[[State, Float[Tensor, "a d"]], State]  # the states after given steps
     solved: float = SOLVED  # sum of squared residuals below which a problem is solved
     largest: float = 0.3  # largest change of a variable in one step

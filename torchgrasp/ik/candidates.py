@@ -153,7 +153,7 @@ def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) ->
 def check_candidates(
     problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
 ) -> Grasps:
-    """Check candidates by `measure_errors`, opening and approach; return a grasp with the first fault for each."""
+    """Return a grasp for each candidate, with pre-grasp, approach and the `Status` of the first check that it fails."""
     hand, world = problem.hand, problem.world
     configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed

@@ -56,7 +56,7 @@ class Settled(NamedTuple):
     """A specification with a known `flat_radius`, and p candidate contacts on flat surface, with their normals."""
 
     spec: ContactSpec
-    candidates: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]] | None  # None: not asked for
+    candidates: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]] | None  # None: no flatness
 
 
 def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:

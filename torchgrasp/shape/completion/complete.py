@@ -145,7 +145,7 @@ class _Image(Batch):
     points: Tensor
     normals: Tensor
     score: float  # infinite if the part is not mirrored
-    variance: Float[Tensor, "n"]  # [m^2], of asymmetry
+    variance: Float[Tensor, "n"]  # [m^2], due to asymmetry
     shared: Float[Tensor, "n planes near"]  # shift [m] for each nearby plane, weighted by the root of its probability
 
     @classmethod

@@ -55,7 +55,7 @@ class SymmetryScorer:
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
-        """Return the scorer of mirror planes of a cloud with normals on a table [m]. Any point may become a probe."""
+        """Return the scorer of a cloud with normals; `table` is its height [m]. Any point may become a probe."""
         assert cloud.normals is not None
         plane, every = None if table is None else Plane.horizontal(table), torch.arange(len(cloud), device="cpu")
         return cls(cloud.points, cloud.normals, silhouettes(cloud), plane, table is not None, every).for_part(every)

@@ -146,7 +146,7 @@ def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
     axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64, device="cpu")])
     points = (wall.points - axis) @ turn.mT + axis
     normals = wall.normals @ turn.mT
-    moved = CENTER_ERROR * (torch.eye(3, dtype=torch.float64, device="cpu") - turn)[:, None]  # a point, with the axis
+    moved = CENTER_ERROR * (torch.eye(3, dtype=torch.float64, device="cpu") - turn)[:, None]  # of points, with the axis
     shared = wall.shared.expand(len(turn), -1, -1).clone()
     shared[..., :2] += (normals[..., None, :] @ moved)[..., 0, :2]
     return HiddenWall(points.flatten(0, 1), normals.flatten(0, 1), shared.flatten(0, 1))
