@@ -1,6 +1,6 @@
 """Commands as processes of their own: killed at random moments, or left by a worker that dies or never answers.
 
-The long ones, 20 kills of each command at its real work, run with `--hypothesis-profile=long`.
+20 kills of each command at its real work run with `--hypothesis-profile=long`.
 """
 
 import json
@@ -126,8 +126,7 @@ def gone(processes: list[int]) -> bool:
 def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
     name: str, tmp_path: Path, request: pytest.FixtureRequest
 ):
-    long = request.config.getoption("--hypothesis-profile") == "long"
-    if name != "sample" and not long:
+    if request.config.getoption("--hypothesis-profile") != "long":
         pytest.skip("takes minutes")
     given, draw = words(name, tmp_path), random.Random(name)
 
@@ -142,9 +141,9 @@ def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
     assert first.returncode == 0, said
     lasts, whole = time.monotonic() - began, contents(tmp_path / "whole")
     killed = attempts = 0
-    while killed < (20 if long else 1):
+    while killed < 20:
         out = tmp_path / f"out{attempts}"
-        for _ in range(5 if long else 2):  # it is continued, and killed again
+        for _ in range(5):  # it is continued, and killed again
             run = start(REAL, tmp_path, command(out))
             time.sleep(draw.uniform(0.2, 1.0) * lasts)
             below = descendants(run.pid)
