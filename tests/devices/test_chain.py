@@ -74,6 +74,7 @@ TEXTS = {
 }
 
 
+@pytest.mark.promise("F8")
 @pytest.mark.parametrize("name", PLANS)
 def test_grasps_of_every_kind_are_where_the_cloud_is(device, hand, name):
     same(PLANS[name](sent(VIEW), hand), PLANS[name](VIEW, hand))
@@ -98,7 +99,8 @@ def test_things_of_a_scene_are_planned_where_it_is(device, hand):
     scene = see((0.0, 0.0, 0.06, 0.1))
     same(take_target(sent(scene).select(1), 0), take_target(scene.select(1), 0))
     there = plan_scene(sent(scene), hand, starts=1, enough=0.01)
-    assert all(thing.grasps is None or thing.grasps.joints.device == DEVICE for thing in there.things)
+    grasps = [thing.grasps for thing in there.things if thing.grasps is not None]
+    assert grasps and all(found.joints.device == DEVICE for found in grasps)
 
 
 def test_completion_is_on_the_cpu(device):

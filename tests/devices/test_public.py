@@ -141,11 +141,6 @@ def test_a_library_of_another_device_is_refused(device, hand, grasps):
     same(found, nearest_postures(library, grasps.contacts, CollisionWorld(table=0.0)))
 
 
-@pytest.mark.promise("F8")
-def test_grasps_are_where_the_cloud_is(device, hand):
-    same(plan_grasps(sent(VIEW), hand, SPEC, 2), plan_grasps(VIEW, hand, SPEC, 2))
-
-
 def test_a_given_shape_decides_where_grasps_are(device, hand, shape):
     assert plan_grasps(VIEW, hand, SPEC, 1, shape=sent(shape)).joints.device == DEVICE
     assert plan_grasps(sent(VIEW), hand, SPEC, 1, shape=shape).joints.device == CPU

@@ -1,7 +1,6 @@
 """A fit that was killed goes on at its last step, to the same bits; several processes fit what one does."""
 
 import dataclasses
-import signal
 from pathlib import Path
 
 import pytest
@@ -55,27 +54,6 @@ def test_a_fit_goes_on_where_it_was_killed(tmp_path):
     )
     longer = fit_mixture(samples, 5, iterations=25, tolerance=0.0, checkpoint=path)
     assert torch.equal(parameters(longer), parameters(fit_mixture(samples, 5, iterations=25, tolerance=0.0)))
-
-
-@pytest.mark.promise("F2")
-def test_a_fit_outlives_kill_9(tmp_path):
-    path = tmp_path / "fit.safetensors"
-    script = f"""
-import os, signal
-import torch
-from tests.make import ring_samples as ring
-from torchgrasp.posture_model.fit import fit_mixture
-torch.set_num_threads({torch.get_num_threads()})
-def kill(progress):
-    if len(progress.log_likelihood) == 6:
-        os.kill(os.getpid(), signal.SIGKILL)
-fit_mixture(ring(), 5, iterations=12, tolerance=0.0, checkpoint={str(path)!r}, observer=kill)
-"""
-    assert run_python("-c", script).returncode == -signal.SIGKILL
-    steps: list[Progress] = []
-    again = fit_mixture(ring(), 5, iterations=12, tolerance=0.0, checkpoint=path, observer=steps.append)
-    assert len(steps) == 6
-    assert torch.equal(parameters(again), parameters(fit_mixture(ring(), 5, iterations=12, tolerance=0.0)))
 
 
 def test_the_checkpoint_of_another_fit_a_damaged_one_and_bad_folders_are_refused(tmp_path):
