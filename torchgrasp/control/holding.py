@@ -87,14 +87,21 @@ class FrictionEstimate:
     """A running estimate of the friction coefficient: mean and standard deviation, common to all fingertips."""
 
     def __init__(self) -> None:
-        self.mean, self.std = 0.8, PRIOR_STD
+        self.mean, self.std, self.least = 0.8, PRIOR_STD, 0.15
 
-    def update(self, ratio: float, force: float) -> None:
-        """Update the estimate by a sliding fingertip's tangential over normal force, and its normal force [N]."""
+    def update(self, ratio: float, force: float, slides: bool = True) -> None:
+        """Update the estimate by a fingertip's tangential over normal force, and its normal force [N].
+
+        A fingertip that sticks shows that friction is at least its ratio; a slide with a smaller ratio is a spin.
+        """
         noise = 0.4 * math.hypot(1.0, ratio) / force
-        weight = self.std**2 / (self.std**2 + noise**2)
-        self.mean = min(max(self.mean + weight * (ratio - self.mean), 0.15), 1.5)
-        self.std = max(self.std * math.sqrt(1 - weight), MIN_STD)
+        if not slides:
+            self.least = max(self.least, ratio - noise)
+            self.mean = max(self.mean, self.least)
+        elif ratio + noise > self.least:
+            weight = self.std**2 / (self.std**2 + noise**2)
+            self.mean = min(max(self.mean + weight * (ratio - self.mean), self.least), 1.5)
+            self.std = max(self.std * math.sqrt(1 - weight), MIN_STD)
 
     @property
     def high(self) -> float:
@@ -170,21 +177,25 @@ class GripHold:
         self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
         self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
         points = observation.tips.numpy() - self.radius[:, None] * self.normals
-        contacts, forces = balance(points), observation.tactile.forces.numpy()
+        contacts, forces = balance(points, observation.tactile.contact.numpy()), observation.tactile.forces.numpy()
+        if friction_ratios(contacts.inner(self.solver.start), self.normals).max() > self.aim:
+            contacts = balance(points)  # the fingers that touch cannot hold without the others
         self.felt = self.felt + low_pass(8.0, period) * (forces - self.felt)
         load = self._weight(contacts.wrench @ forces.ravel())
         self.load = self.load + low_pass(3.0, period) * (load - self.load)
         self.carried = self.carried + low_pass(0.7, period) * (load - self.carried)  # a faster one rocks the object
-        push = self.cover * (PUSH + max(self.unfelt - self.weight, 0.0))
+        push = self.cover * (PUSH + self.unfelt)
         return contacts, push * push_reserve(contacts, self.normals, self.centre - points.mean(0), self.aim)
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
-        """Return a load wrench; before the lift only the part that weight can cause, an upward force and its torque."""
-        if self.up is None or self.released:
+        """Return the part of a load wrench that weight and, once lifted, pushes of `PUSH` can cause."""
+        if self.up is None:
             return load
-        lifted = max(float(load[:3] @ self.up), 0.0)
-        torque = load[3:] * min(1.0, 0.1 * lifted / max(float(np.linalg.norm(load[3:])), 1e-9))
-        return np.concatenate([lifted * self.up, torque])
+        lifted, most = max(float(load[:3] @ self.up), 0.0), PUSH if self.released else 0.0
+        side = load[:3] - float(load[:3] @ self.up) * self.up
+        side = side * min(1.0, most / max(float(np.linalg.norm(side)), 1e-9))
+        torque = load[3:] * min(1.0, 0.1 * (lifted + most) / max(float(np.linalg.norm(load[3:])), 1e-9))
+        return np.concatenate([lifted * self.up + side, torque])
 
     def _adapt(self, observation: Observation, period: float) -> None:
         """Update the friction estimate by sliding fingers, and reduce forces that are not needed."""
@@ -193,8 +204,8 @@ class GripHold:
         if self.time < RAMP:
             return
         push, ratios = -(self.felt * self.normals).sum(-1), friction_ratios(self.felt, self.normals)
-        for i in np.flatnonzero(self.sliding & (push > 0.5 * MIN_PUSH)):
-            self.friction.update(float(min(ratios[i], 2.0)), float(push[i]))
+        for i in np.flatnonzero(push > 0.5 * MIN_PUSH):
+            self.friction.update(float(min(ratios[i], 2.0)), float(push[i]), bool(self.sliding[i]))
         self._release(period)
 
     def _release(self, period: float) -> None:
@@ -246,15 +257,17 @@ def push_reserve(contacts: Balance, normals: np.ndarray, arm: np.ndarray, fricti
 def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
     """Return the object's centre [m] in the hand's frame and its largest likely weight [N], from what a robot knows.
 
-    The volume is that of the estimated surface, or else of a ball as wide as the contacts.
+    The weight is that of water in the volume of the estimated surface, or else of a ball as wide as the contacts; a
+    small thing may be of metal.
     """
-    field, points, density = reference.surface, reference.gains.target, 1000.0  # few things are denser than water
+    field, points, density = reference.surface, reference.gains.target, 1000.0
     if field is None or not bool((field.values < 0).any()):
-        return points.mean(0).numpy(), 9.81 * density * math.pi / 6 * float(torch.cdist(points, points).max()) ** 3
+        ball = math.pi / 6 * float(torch.cdist(points, points).max()) ** 3
+        return points.mean(0).numpy(), 9.81 * max(density * ball, 0.4)
     shell, inside = (field.values.abs() < field.spacing).nonzero(), (field.values < 0).nonzero()
     inside = inside[((inside >= shell.amin(0)) & (inside <= shell.amax(0))).all(-1)]  # farther the sign may be wrong
     centre = apply(inverse(reference.obj_from_hand), (field.origin + field.spacing * inside.double().mean(0))[None])
-    return centre[0].numpy(), 9.81 * density * len(inside) * field.spacing**3
+    return centre[0].numpy(), 9.81 * max(density * len(inside) * field.spacing**3, 0.4)
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from torchgrasp.plan.forces import grasp_map
 
@@ -28,21 +28,25 @@ PENALTY, KNEE = 500.0, 0.9
 class Balance(NamedTuple):
     """The grasp map of contacts (matrix from n force components to the wrench), its pseudo-inverse and its null space.
 
-    The columns of `free` are a basis of the null space: k internal forces, which exert no wrench.
+    The columns of `free` are a basis of the null space: k internal forces, which exert no wrench. A finger in the air
+    exerts none either, so its force is free.
     """
 
     wrench: Float[Array, "6 n"]
     inverse: Float[Array, "n 6"]
     free: Float[Array, "n k"]
 
+    def inner(self, forces: Float[Array, "f 3"]) -> Float[Array, "f 3"]:
+        """Return the part of fingertip forces that exerts no wrench."""
+        return (self.free @ (self.free.T @ forces.ravel())).reshape(-1, 3)
 
-def balance(points: Float[Array, "f 3"]) -> Balance:
-    """Return the grasp map at contact points [m], its pseudo-inverse and its null space, from one SVD."""
-    wrench = grasp_map(torch.from_numpy(points)).numpy()
+
+def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = True) -> Balance:
+    """Return the grasp map at contact points [m] that touch, its pseudo-inverse and its null space, from one SVD."""
+    wrench = grasp_map(torch.from_numpy(points)).numpy() * np.repeat(np.broadcast_to(touching, len(points)), 3)
     left, values, right = np.linalg.svd(wrench)
-    least = 1e-12 * values[0]  # contacts on one line have no greater singular value
-    inverse = np.where(values > least, 1 / np.maximum(values, least), 0.0)
-    return Balance(wrench, (right[:6].T * inverse) @ left.T, right[6:].T)
+    rank = int((values > 1e-12 * values[0]).sum())  # that of contacts on one line is 5
+    return Balance(wrench, (right[:rank].T / values[:rank]) @ left[:, :rank].T, right[rank:].T)
 
 
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
@@ -75,7 +79,8 @@ class LeastForces:
         """Return the least forces [N] that exert the wrench `load`, with normal forces above each finger's `floor` [N].
 
         Without the normal force `reserve` [N], the forces are within the cones of the coefficient `friction`. If no
-        such forces are found, the coefficient is raised to the least with which forces were found.
+        such forces are found, the coefficient is raised to the least with which forces were found. The coefficient is
+        also at least 1.25 times the one that the internal forces `start` need: below it the forces would grow huge.
         """
         floor = np.maximum(floor, reserve)
         count = len(normals)
@@ -85,6 +90,8 @@ class LeastForces:
         barrier = _Barrier(contacts, normals, limits, load, gap, reserve)
         growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # added internal forces, if the load has grown
         tried = barrier.place(self.forces) + growth[:, None] * barrier.place(self.start, 0.0)
+        needed = 1.25 * float(friction_ratios(contacts.inner(self.start), normals).max())
+        friction = max(friction, needed) if math.isfinite(needed) else friction
         z = barrier.choose(tried, friction, floor)
         lengths = 2.0 ** np.arange(8)  # multiples of a step that is safe for every self-concordant function
         for _ in range(8 if math.isfinite(barrier.squared) else 0):  # no cone contains a finger that does not press
