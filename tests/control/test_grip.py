@@ -96,17 +96,20 @@ def test_forces_with_a_reserve_stay_in_their_cones_under_a_push_from_any_side(fr
 
 def test_the_likely_body_is_the_estimated_surface_or_a_ball_as_wide_as_the_contacts():
     grid = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 51).double()] * 3).reshape(51, 51, 51, 3)
-    ball = torch.linalg.vector_norm(grid - real([0.01, 0.02, 0.0]), dim=-1) - 0.04
-    turned, volume = torch.eye(4).double(), 4 / 3 * math.pi * 0.04**3
+    ball = torch.linalg.vector_norm(grid - real([0.01, 0.02, 0.0]), dim=-1) - 0.06
+    turned, volume = torch.eye(4).double(), 4 / 3 * math.pi * 0.06**3
     turned[:3, 3] = real([0.0, 0.0, 0.05])
     ball[:, :, -1] = -0.2  # a sign that is wrong far from the surface
     field = SignedDistanceField(real([-0.1, -0.1, -0.1]), 0.004, ball)
     centre, weight = likely_body(dataclasses.replace(reference(), surface=field, obj_from_hand=turned))
     np.testing.assert_allclose(centre, [0.01, 0.02, -0.05], atol=1e-3)
     assert weight == pytest.approx(9810 * volume, rel=0.05)
-    centre, weight = likely_body(reference())
+    known = reference()
+    centre, weight = likely_body(known)
     np.testing.assert_allclose(centre, POINTS.mean(0))
-    assert weight == pytest.approx(9810 * math.pi / 6 * (0.06**2 + 0.02**2) ** 1.5)
+    assert weight == pytest.approx(9.81 * 0.4)  # a ball of 130 g, if it were water
+    wide = dataclasses.replace(known, gains=dataclasses.replace(known.gains, target=2 * known.gains.target))
+    assert likely_body(wide)[1] == pytest.approx(9810 * math.pi / 6 * (0.12**2 + 0.04**2) ** 1.5)
 
 
 @pytest.mark.parametrize("fingertips", [3, 4, 5])
@@ -121,6 +124,21 @@ def test_balance_gives_grasp_map_inverse_and_null_space(fingertips):
     np.testing.assert_allclose(found.free.T @ found.free, np.eye(3 * fingertips - 6), atol=1e-12)
     line = balance(np.arange(fingertips)[:, None] * np.array([0.0, 0.01, 0.02]))
     assert np.isfinite(line.inverse).all() and abs(line.inverse).max() < 1e3
+    assert line.free.shape[1] == 3 * fingertips - 5  # nothing resists a torque about the line
+
+
+def test_a_finger_in_the_air_bears_no_load_and_presses_as_little_as_allowed():
+    points, floor = np.array([[0.0, -0.03, 0], [0, 0.03, 0], [0.02, 0.03, 0]]), np.array([0.2, 0.2, 0.7])
+    normals = np.array([[0.0, -1, 0], [0, 1, 0], [0, 1, 0]])
+    contacts, load = balance(points, np.array([True, True, False])), np.array([1.0, 0, 2, 0, 0, 0])
+    load[3:] = np.cross(points[:2].mean(0) - points.mean(0), load[:3])  # it acts between the two fingers
+    solver, forces = LeastForces(-normals.copy(), np.ones(1), 100.0), -normals
+    for _ in range(10):
+        forces = solver.solve(contacts, normals, FREE, load, 0.5, floor)
+    np.testing.assert_allclose(forces[:2].sum(0), load[:3], atol=1e-9)
+    push = -(forces * normals).sum(-1)
+    least = math.sqrt(5) / 2 / 0.5  # [N] of each of the two, which share the load
+    assert push[:2] == pytest.approx([least] * 2, rel=0.05) and push[2] == pytest.approx(0.7, rel=0.1)
 
 
 def test_least_forces_keep_the_floors():
@@ -137,6 +155,20 @@ def test_friction_estimate_is_a_gaussian_posterior():
     assert estimate.mean == pytest.approx((0.8 * PRIOR_STD**-2 + 0.5 * noise**-2) / precision)
     assert estimate.std == pytest.approx(precision**-0.5)
     assert estimate.mean < estimate.high
+
+
+def test_friction_is_at_least_the_ratio_of_a_finger_that_sticks():
+    estimate = FrictionEstimate()
+    estimate.update(0.6, 20.0, slides=False)
+    least = 0.6 - 0.4 * math.hypot(1.0, 0.6) / 20
+    assert estimate.mean == 0.8 and estimate.least == pytest.approx(least)
+    estimate.update(0.3, 20.0)  # a finger that spins
+    assert estimate.mean == 0.8
+    for _ in range(100):
+        estimate.update(0.58, 20.0)
+    assert estimate.mean == pytest.approx(0.58, abs=0.01)
+    estimate.update(0.9, 20.0, slides=False)
+    assert estimate.mean == estimate.least > 0.8
 
 
 @functools.cache
@@ -214,8 +246,6 @@ def test_grip_floors_stay_finite_for_a_planned_force_along_the_surface(sideways,
     tactile = dataclasses.replace(seen.tactile, normals=normals, points=points)
     known, seen = dataclasses.replace(reference(), max_force=max_force), dataclasses.replace(seen, tactile=tactile)
     hold = GripHold(known, seen, torch.zeros(9).double())
-    hold.load = np.array([2.0, 3.0, 6.0, 9.0, 9.0, 9.0])  # force [N] and torque [N m]
-    assert hold.weight == pytest.approx(7.0)
-    floor = hold._floor()
+    floor = hold._bounded(np.maximum(hold.grip, MIN_PUSH))
     assert np.isfinite(floor).all() and (floor > 0).all()
     assert max_force is not None or (floor >= MIN_PUSH).all()

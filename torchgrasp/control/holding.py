@@ -154,22 +154,22 @@ class GripHold:
         jacobian, fastest_rise = observation.jacobian.numpy(), 60.0  # [N/s]
         contacts, reserve = self._feel(observation, period)
         self._adapt(observation, period)
-        wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, self._floor(), reserve)
+        floor = self._bounded(np.maximum(self.cover * self.grip, MIN_PUSH))
+        wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, floor, reserve)
         self._judge(wanted, jacobian, period)
         step = self._command(contacts, wanted, period) - self.sent
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         self.sent = self.sent + step * np.minimum(1.0, fastest_rise * period / np.maximum(length, 1e-9))
+        self.sent /= max(1.0, self.solver.share(self.sent, self.normals, jacobian))
         torque = np.einsum("cij,ci->j", jacobian, self.sent)
-        torque /= max(1.0, float((np.abs(torque) / self.solver.effort).max()))
         share = min(self.time / RAMP, 1.0)
         lead = torch.from_numpy(torque) / self.reference.kp
         return self.start + share * (self.rest + lead - self.start)
 
-    def _floor(self) -> np.ndarray:
-        """Return the least allowed normal force [N] of each finger; it leaves room below the largest allowed force."""
-        floor = np.maximum(self.cover * self.grip, MIN_PUSH)
-        largest = float((floor / self.planned).max() * self.planned.max())
-        return floor * min(1.0, 0.8 * self.solver.most / largest)
+    def _bounded(self, push: np.ndarray) -> np.ndarray:
+        """Return normal forces [N] of all fingers, reduced where a balance would need forces near the largest."""
+        largest = float((push / self.planned).max() * self.planned.max())
+        return push * min(1.0, 0.8 * self.solver.most / max(largest, 1e-9))
 
     def _feel(self, observation: Observation, period: float) -> tuple[Balance, np.ndarray]:
         """Filter the sensed forces, load and normals; return the contacts' grasp map and each finger's reserve [N]."""
@@ -185,7 +185,8 @@ class GripHold:
         self.load = self.load + low_pass(3.0, period) * (load - self.load)
         self.carried = self.carried + low_pass(0.7, period) * (load - self.carried)  # a faster one rocks the object
         push = self.cover * (PUSH + self.unfelt)
-        return contacts, push * push_reserve(contacts, self.normals, self.centre - points.mean(0), self.aim)
+        reserve = push * push_reserve(contacts, self.normals, self.centre - points.mean(0), self.aim)
+        return contacts, self._bounded(reserve)
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
         """Return the part of a load wrench that weight and, once lifted, pushes of `PUSH` can cause."""
@@ -220,7 +221,7 @@ class GripHold:
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
         """Choose the friction coefficient for the forces of the next tick; judge whether the load is too heavy."""
-        share, fastest = self.solver.share(self.normals, jacobian), 2.0 * period
+        share, fastest = self.solver.share(wanted, self.normals, jacobian), 2.0 * period
         self.cover = min(max(self.cover + fastest * (2 if share < 0.95 else -4), 0.0), 1.0)
         goal = self.friction.high if share > 1.0 and self.cover == 0.0 else self.friction.mean
         self.aim += min(max(goal - self.aim, -fastest), fastest)
