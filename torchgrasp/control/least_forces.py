@@ -106,7 +106,9 @@ class LeastForces:
         self.forces = barrier.forces(z)
         return self.forces
 
-    def share(self, forces: Float[Array, "f 3"], normals: Float[Array, "f 3"], jacobian: Float[Array, "f 3 j"]) -> float:
+    def share(
+        self, forces: Float[Array, "f 3"], normals: Float[Array, "f 3"], jacobian: Float[Array, "f 3 j"]
+    ) -> float:
         """Return the largest ratio of a joint torque or normal force to its limit, for given forces [N]."""
         torque = np.abs(np.einsum("nij,ni->j", jacobian, forces)) / self.effort
         return max(float(torque.max()), float((-(forces * normals).sum(-1)).max()) / self.most)
