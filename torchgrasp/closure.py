@@ -171,14 +171,14 @@ class ClosingOptions(Value):
             with a `palm_reach` of 0.
 
     >>> ClosingOptions(palm_reach=0.0, stops=0).attempts  # an arm that cannot yield
-    3
+    5
     """
 
     wait: bool = True
     pose_estimate: bool = True
     palm_reach: Annotated[float, Range(0.0, 0.1)] = 0.07
     stops: Annotated[int, Range(0, 100)] = 3
-    attempts: Annotated[int, Range(1, 100)] = 3
+    attempts: Annotated[int, Range(1, 100)] = 5
 
     def __post_init__(self) -> None:
         """Raise `BadArgument` for an option without another option that it needs."""

@@ -53,7 +53,7 @@ def come(hand, shift, ticks=3000):
 
 
 def test_guarded_approach_passes_an_object_in_its_place():
-    hand = GuardedApproach(above(), ALL, LENGTH)
+    hand = GuardedApproach(above(), ALL, LENGTH, [])
     lefts, palms = come(hand, real([0, 0, 0]))
     speeds = -lefts.diff() / PERIOD
     assert hand.stops == 0 and lefts[-1] == 0.0 and not palms.any()
@@ -66,7 +66,7 @@ def test_guarded_approach_passes_an_object_in_its_place():
 @pytest.mark.parametrize("shift", [(0.016, 0, 0), (-0.015, 0, 0.004), (0.012, 0, 0.014)])
 def test_guarded_approach_moves_the_palm_to_the_touched_object(shift):
     shift = real(shift)
-    hand = GuardedApproach(above(), ALL, LENGTH)
+    hand = GuardedApproach(above(), ALL, LENGTH, [])
     _, palms = come(hand, shift)
     assert 1 <= hand.stops < ALL.stops
     assert (hand.displacement[:3] - shift).norm() < 0.005
@@ -76,7 +76,7 @@ def test_guarded_approach_moves_the_palm_to_the_touched_object(shift):
 
 
 def test_guarded_approach_draws_back_before_its_palm_moves_within_its_reach():
-    lefts, palms = come(GuardedApproach(above(), ALL, LENGTH), real([0.016, 0, 0]))
+    lefts, palms = come(GuardedApproach(above(), ALL, LENGTH, []), real([0.016, 0, 0]))
     stopped = int((lefts.diff() >= 0).int().argmax())
     first = int((palms.abs().sum(-1) > 0).int().argmax())
     feeling = 0.06 + (len(TURNS) + len(FINE_TURNS) + 2) * PERIOD
@@ -85,7 +85,7 @@ def test_guarded_approach_draws_back_before_its_palm_moves_within_its_reach():
     assert lefts[first] >= float(lefts[stopped]) + 0.02 - 1e-9
     assert (-lefts[first:].diff()).max() <= CAREFUL_SPEED * PERIOD * (1 + 1e-9)  # it comes slowly then
     assert lefts.max() <= LENGTH
-    hand = GuardedApproach(above(), ALL, LENGTH)
+    hand = GuardedApproach(above(), ALL, LENGTH, [])
     for _ in range(500):
         hand(feel(hand, real([0.03, 0, 0])), 4 * PERIOD)
         assert hand.palm.norm() <= ALL.palm_reach * (1 + 1e-9)
@@ -93,7 +93,7 @@ def test_guarded_approach_draws_back_before_its_palm_moves_within_its_reach():
 
 @pytest.mark.parametrize("placed", [True, False])
 def test_guarded_approach_arrives_though_every_finger_touches_all_the_way(placed):
-    hand, seen = GuardedApproach(above(), ALL, LENGTH), observation(contact=torch.ones(3, dtype=torch.bool))
+    hand, seen = GuardedApproach(above(), ALL, LENGTH, []), observation(contact=torch.ones(3, dtype=torch.bool))
     if not placed:
         nowhere = torch.full((3, 3), torch.nan).double()
         seen = dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, points=nowhere, normals=nowhere))
@@ -108,7 +108,7 @@ def test_guarded_approach_arrives_though_every_finger_touches_all_the_way(placed
 def test_guarded_approach_feels_a_link_by_the_drives_of_its_joints():
     hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
     plan = dataclasses.replace(ClosingReference.from_grasp(hand, grasp), table=above().table, surface=ball_field())
-    coming, joints = GuardedApproach(plan, ALL, LENGTH), plan.pregrasp
+    coming, joints = GuardedApproach(plan, ALL, LENGTH, []), plan.pregrasp
     still = observe(hand, joints, no_contact())
     for _ in range(30):
         coming(still, PERIOD)
@@ -121,9 +121,9 @@ def test_guarded_approach_feels_a_link_by_the_drives_of_its_joints():
         assert coming.feeling is stops
     spheres = hand.collision_spheres
     moved = hand.tree.moves[spheres.link_index, joint] > 0
-    assert 0 < len(coming.touches.links) == int(moved.sum()) < len(moved)
+    assert 0 < len(coming.felt[0].links) == int(moved.sum()) < len(moved)
     there = hand.sphere_centres(plan.pick(pushed))[moved] - coming.left * plan.approach
-    assert torch.allclose(coming.touches.links[:, :3], there, rtol=0, atol=1e-9)
+    assert torch.allclose(coming.felt[0].links[:, :3], there, rtol=0, atol=1e-9)
 
 
 def approach(controller, shift):
@@ -178,7 +178,7 @@ def test_controller_comes_down_once_more_after_it_closed_on_nothing():
         targets = controller.step(nothing, PERIOD)
         lefts.append(targets.left)
         palms.append(targets.palm)
-    assert controller.attempts == ALL.attempts == 3
+    assert controller.attempts == ALL.attempts
     left, palm = real(lefts), torch.stack(palms)
     ups = ((left[1:] > 0) & (left[:-1] == 0)).nonzero()[:, 0]
     assert len(ups) == ALL.attempts - 1  # it draws back before its palm moves to another place

@@ -67,10 +67,10 @@ def touch(reference, points, normals, contact=(True, True, True), tips=None) -> 
     return touches
 
 
-def locate(reference, touches, expected=STILL, visited=()):
-    search = Localization(reference, expected, visited)
+def locate(reference, *touches):
+    search = Localization(reference, touches)
     while not search.done:
-        search(touches)
+        search()
     return search.displacement
 
 
@@ -85,30 +85,42 @@ def test_localization_finds_a_ball_from_three_touches(shift):
     assert (found[:3] - wanted).norm() < PITCH / 2
 
 
-def test_localization_finds_the_link_that_touches_and_the_nearest_place_to_where_the_object_is_expected():
+def test_localization_finds_the_link_that_touches_on_the_side_of_earlier_touches():
     # the nearer of two spheres of 10 mm touches a ball of 30 mm: the centres are 40 mm apart, on the line between them
     there, gap = known(ball_field()), RADIUS + 0.01
     links = torch.cat([CENTER + real([[0.09, 0, 0], [0.3, 0, 0.3]]), real([[0.01], [0.01]])], -1)
     far, nothing = CENTER + 0.3 * torch.eye(3).double(), (False, False, False)
     touches = Touches(there, links)
     touches.add(dataclasses.replace(observation(contact=torch.tensor(nothing)), tips=far), STILL)
-    for expected in (real([0.0, 0, 0.0]), real([0.02, 0, 0.04]), real([0.03, 0, -0.03])):
-        towards = unit(expected - real([0.09, 0, 0]))
-        wanted = real([0.09, 0, 0]) + gap * towards
-        share = 0.03**2 / (0.03**2 + 0.004**2)  # of Gaussians: the prior draws a little
-        wanted = expected + share * (wanted - expected)
-        found = locate(there, touches, expected)
-        assert (found[:3] - wanted).norm() < 3e-3
+    found = locate(there, touches)
+    wanted = real([0.05, 0, 0]) * 0.03**2 / (0.03**2 + 0.004**2)  # of Gaussians: the prior draws a little
+    assert (found[:3] - wanted).norm() < 3e-3
+    for side in (1, -1):
+        place = real([0.09, 0, 0]) + gap * unit(real([-1.0, 0, side]))
+        earlier = touch(there, CENTER + RADIUS * BALL_POINTS + place, BALL_POINTS)
+        found = locate(there, earlier, touches)
+        assert (found[:3] - place).norm() < 6e-3  # without the earlier touches it would be off by 30 mm
+        assert (locate(there, earlier)[:3] - place).norm() < PITCH / 2
 
 
-def test_localization_without_a_touch_keeps_away_from_visited_places_and_near_where_the_object_is_expected():
-    there, far = known(ball_field()), CENTER + 0.3 * torch.eye(3).double()
-    nothing, visited = touch(there, far, BALL_POINTS, (False, False, False), far), []
+def test_localization_believes_the_last_of_touches_that_contradict_each_other():
+    there, places = known(ball_field()), (real([0.02, 0, 0.01]), real([-0.02, 0, 0.02]))
+    one, other = (touch(there, CENTER + RADIUS * BALL_POINTS + place, BALL_POINTS) for place in places)
+    assert (locate(there, other, one)[:3] - places[0]).norm() < 4e-3
+    assert (locate(there, one, other)[:3] - places[1]).norm() < 4e-3
+
+
+def test_localization_after_closing_on_nothing_keeps_away_from_where_the_palm_was():
+    there, far, felt, places = known(ball_field()), CENTER + 0.3 * torch.eye(3).double(), [], []
     for _ in range(4):
-        visited.append(locate(there, nothing, visited=visited)[:3])
-    gaps = torch.stack(visited)[:, None] - torch.stack(visited)
-    assert visited[0].norm() == 0.0 and all(0.02 < x.norm() < 0.06 for x in visited[1:])
+        places.append(locate(there, *felt)[:3])
+        felt.append(Touches(there))
+        nothing = observation(contact=torch.zeros(3, dtype=torch.bool))
+        felt[-1].add(dataclasses.replace(nothing, tips=far - places[-1]), places[-1])
+    gaps = torch.stack(places)[:, None] - torch.stack(places)
+    assert places[0].norm() == 0.0 and all(0.02 < x.norm() < 0.06 for x in places[1:])
     assert (gaps.norm(dim=-1) + torch.eye(4)).min() > 0.02
+    assert felt[-1].nothing and not touch(there, far, BALL_POINTS, (True, False, False)).nothing
 
 
 def test_touches_with_links_keep_what_a_fingertip_felt_before_it_lost_the_object():
@@ -186,10 +198,10 @@ def test_localization_ignores_dead_fingers():
 
 
 def test_localization_tries_one_turn_a_call_and_finds_no_displacement_without_touches():
-    there, far = known(ball_field()), CENTER + 0.2 * torch.eye(3).double()
-    assert locate(there, touch(there, far, BALL_POINTS, (False, False, False), far)).norm() == 0.0
-    search, touches = Localization(there, STILL), touch(there, CENTER + RADIUS * BALL_POINTS, BALL_POINTS)
+    there = known(ball_field())
+    assert locate(there).norm() == 0.0
+    search = Localization(there, [touch(there, CENTER + RADIUS * BALL_POINTS, BALL_POINTS)])
     for k in range(len(TURNS) + len(FINE_TURNS)):
         assert not search.done and search.step == k
-        search(touches)
+        search()
     assert search.done and math.isfinite(search.cost)

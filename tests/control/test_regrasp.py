@@ -26,7 +26,7 @@ STILL, PLACE = torch.zeros(3).double(), torch.zeros(6).double()
 
 
 def judge(seen, believed=PLACE, last=False, reference=None) -> GraspCheck:
-    check = GraspCheck(on_table() if reference is None else reference, believed, STILL, last)
+    check = GraspCheck(on_table() if reference is None else reference, believed, STILL, last, [])
     for k in range(60):
         check(seen, k * PERIOD)
     return check

@@ -92,9 +92,8 @@ class GraspController:
     def _prepare(self, reference: ClosingReference, approach: float) -> None:
         """Begin with a plan: first its approach, if there is one, and then its closing."""
         self.reference, self.attempts, self.stops, self.length = reference, 0, 0, approach
-        self.guard = GuardedApproach(reference, self.options, approach) if approach else None
-        self.felt = Touches(reference) if approach else None  # at the last stop
-        self.visited: list[Float[Tensor, 3]] = []  # the palm's displacements [m] in earlier attempts
+        self.felt: list[Touches] = []  # at each stop, and in each closing
+        self.guard = GuardedApproach(reference, self.options, approach, self.felt) if approach else None
         self._make_closing = functools.partial(make_closing, reference, self.mode, self.options)
         self._begin(self._make_closing())
         self.targets = Targets(reference.expand(reference.pregrasp), self.path, approach)
@@ -185,7 +184,6 @@ class GraspController:
         guard(observation, period)
         if guard.done:
             self.guard, self.stops = None, self.stops + guard.stops
-            self.felt = guard.touches if guard.stops else self.felt
             if guard.careful and isinstance(self.closing, UncertaintyClosing):
                 self.closing.begin_at(guard.displacement, guard.palm)
         return Targets(self.targets.joints, self.path + guard.palm, guard.left)
@@ -200,6 +198,9 @@ class GraspController:
                 return self.targets.joints  # without a finger that opposes them, pressing ones push the object away
             return self.hold(observation, period)
         if not over or isinstance(self.closing, OpenLoopClosing):
+            if self.time == 0.0:
+                self.felt.append(Touches(self.reference, torch.zeros(0, 4, dtype=torch.float64)))
+            self.felt[-1].add(observation, self.closing.palm)
             self.time += period
             return self.closing(observation, period)
         if self._make_hold is None:
@@ -209,10 +210,9 @@ class GraspController:
             self.hold = self._make_hold(self.reference, observation, self.targets.joints)
         if self.options.attempts > 1 and self.reference.table is not None:
             assert isinstance(self.closing, UncertaintyClosing)
-            self.visited = [*self.visited, self.closing.palm]
             last = self.attempts >= self.options.attempts
-            known = self.closing.displacement, self.closing.palm, last, self.felt, self.visited
-            self.check = GraspCheck(self.reference, *known)
+            found = self.closing.displacement, self.closing.palm
+            self.check = GraspCheck(self.reference, *found, last, self.felt)
         return self.targets.joints
 
     def _judge(self, observation: Observation) -> None:
@@ -234,7 +234,7 @@ class GraspController:
             assert isinstance(closing, UncertaintyClosing)
             self._begin(closing.begin_at(reopening.displacement, reopening.palm))
             if self.length:
-                self.guard = GuardedApproach(self.reference, self.options, self.length, reopening)
+                self.guard = GuardedApproach(self.reference, self.options, self.length, self.felt, reopening)
         return targets
 
 

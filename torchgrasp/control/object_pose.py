@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.tactile import Observation
+from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.geometry.frames import apply, rotation_from_vector
 from torchgrasp.geometry.linalg import across, unit
 
@@ -90,7 +90,7 @@ class Touches:
         self.points, self.normals = torch.zeros(2, *reference.normals.shape, dtype=torch.float64)
         self.count = torch.zeros(len(reference.normals), dtype=torch.int64)
         self.tips, self.known = reference.gains.target, reference.alive
-        self.contact = torch.zeros_like(self.known)
+        self.contact, self.palm, self.nothing = torch.zeros_like(self.known), STILL, not len(self.links)
 
     def add(self, observation: Observation, palm: Float[Tensor, "3"]) -> None:
         """Add one observation to the averages; `palm` [m] is how far the palm is displaced from its plan."""
@@ -99,7 +99,8 @@ class Touches:
         self.points = self.points + torch.where(placed[:, None], sensed.points + palm, 0.0)
         self.normals = self.normals + torch.where(placed[:, None], sensed.normals, 0.0)
         self.count = self.count + placed
-        self.tips, self.contact = observation.tips + palm, sensed.contact
+        self.tips, self.contact, self.palm = observation.tips + palm, sensed.contact, palm
+        self.nothing = self.nothing and not bool(sensed.contact.any())
 
     @property
     def felt(self) -> Bool[Tensor, "f"]:
@@ -112,22 +113,19 @@ class Touches:
 
 
 class Localization:
-    """Search for the object displacement that best explains the touches; each call tries one rotation angle.
+    """Search for the object displacement that best explains the `touches`; each call tries one rotation angle.
 
-    Before any touch, the object is probably displaced by `expected` [m], and not by one of the `visited` displacements
-    [m]. `displacement` holds the translation of the contacts' centroid [m] and the rotation about it [rad].
+    The last touches tell most, because each touch may move the object. Where the hand closed on `nothing`, the object
+    is probably not. `displacement` holds the translation of the contacts' centroid [m] and the rotation about it [rad].
     """
 
-    def __init__(
-        self, reference: ClosingReference, expected: Float[Tensor, "3"], visited: Sequence[Float[Tensor, "3"]] = ()
-    ) -> None:
+    def __init__(self, reference: ClosingReference, touches: Sequence[Touches]) -> None:
         assert reference.surface is not None and reference.table is not None
         self.surface, self.obj_from_hand = reference.surface, reference.obj_from_hand.double()
         self.center, self.radius = reference.gains.target.mean(0), reference.hand.tips.radius.double()
         self.up = unit(reference.table.normal.double())
         self.axes = torch.stack(across(self.up))
-        self.expected, self.visited = self.axes @ expected, [self.axes @ place for place in visited]
-        self.step, self.cost = 0, torch.inf
+        self.touches, self.step, self.cost = [*reversed(touches)], 0, torch.inf
         self.shift, self.turn = torch.zeros(2, dtype=torch.float64), 0.0
         self.coarse = self.shift, self.turn
 
@@ -141,7 +139,7 @@ class Localization:
         """The best displacement of the object so far: translation [m] and rotation vector [rad]."""
         return torch.cat([self.shift @ self.axes, self.turn * self.up])
 
-    def __call__(self, touches: Touches) -> None:
+    def __call__(self) -> None:
         """Try one rotation angle with a grid of translations; the last calls search finely around the best result."""
         if self.step < len(TURNS):
             shifts, turn = _square(FARTHEST, PITCH), TURNS[self.step]
@@ -151,15 +149,25 @@ class Localization:
             middle, facing = self.coarse
             fine = PITCH / 4
             shifts, turn = middle + _square(PITCH - fine, fine), facing + FINE_TURNS[self.step - len(TURNS)]
-        costs = self._costs(touches, shifts, turn)
+        costs = self._costs(shifts, turn)
         best = int(costs.argmin())
         if float(costs[best]) < self.cost:
             self.cost, self.shift, self.turn = float(costs[best]), shifts[best].clone(), turn
         self.step += 1
 
-    def _costs(self, touches: Touches, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
+    def _costs(self, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
         """Return the negative log-probability of each translation [m] along the table, for one rotation [rad]."""
-        surface_std, normal_std, shift_std, turn_std = 0.004, 0.3, 0.03, 0.15  # [m, 1, m, rad]
+        shift_std, turn_std = 0.03, 0.15  # [m, rad]
+        cost = (shifts / shift_std).square().sum(-1) + (turn / turn_std) ** 2
+        for age, touches in enumerate(self.touches):  # a touch moves the object by twice the surface's deviation
+            cost = cost + self._misfit(touches, shifts, turn) / (1 + 4 * age)
+            if touches.nothing:
+                cost = cost + 80 * torch.exp(-2 * ((shifts - self.axes @ touches.palm) / shift_std).square().sum(-1))
+        return 0.5 * cost
+
+    def _misfit(self, touches: Touches, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
+        """Return how badly touches fit to each translation [m] along the table, for one rotation [rad]."""
+        surface_std, normal_std = 0.004, 0.3  # [m, 1]
         gap, worst = 0.001, 20.0  # least distance [m] of a tip in the air; bound on the cost of one tip
         felt, (points, normals) = touches.felt, touches.means()
         rotation = rotation_from_vector(turn * self.up)
@@ -175,9 +183,7 @@ class Localization:
             before = (touches.links[:, :3] - self.center - (shifts @ self.axes)[:, None]) @ rotation + self.center
             off = self.surface.query(apply(self.obj_from_hand, before))[0] - touches.links[:, 3]
             fit = fit + (off.abs().amin(-1) / surface_std).square().clamp_max(2 * worst)
-        for place in self.visited:
-            fit = fit + 4 * worst * torch.exp(-2 * ((shifts - place) / shift_std).square().sum(-1))
-        return 0.5 * (fit + ((shifts - self.expected) / shift_std).square().sum(-1) + (turn / turn_std) ** 2)
+        return fit
 
 
 def _square(half: float, pitch: float) -> Float[Tensor, "m 2"]:

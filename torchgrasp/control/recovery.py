@@ -4,7 +4,6 @@ The first two locate the object from touches (`Localization`) and move the palm 
 """
 
 import math
-from collections.abc import Sequence
 from typing import Annotated
 
 import torch
@@ -48,12 +47,13 @@ class GuardedApproach:
     starts at its pre-grasp, and retreats first.
 
     `left` [m] is the remaining length of the approach, `palm` [m] the palm's displacement from its planned path,
-    `stops` the number of stops. `displacement` holds the object's translation [m] and rotation [rad] at the last touch.
+    `stops` the number of stops, whose touches are appended to `felt`. `displacement` holds the object's translation [m] and rotation [rad] at the last touch.
     """
 
     def __init__(
-        self, reference: ClosingReference, options: ClosingOptions, length: float, after: "Reopening | None" = None
-    ) -> None:
+        self, reference: ClosingReference, options: ClosingOptions, length: float, felt: list[Touches],
+        after: "Reopening | None" = None,
+    ) -> None:  # fmt: skip
         assert reference.approach is not None
         self.reference, self.options, self.length, self.direction = reference, options, length, reference.approach
         self.left, self.speed, self.retreat, self.stops = length, 0.0, 0.0, 0
@@ -63,7 +63,7 @@ class GuardedApproach:
         if after is not None:
             self.left, self.palm = 0.0, after.palm
             self._turn_to(after.displacement)
-        self.touches, self.search = Touches(reference), Localization(reference, STILL)
+        self.felt, self.search = felt, Localization(reference, ())
 
     @property
     def done(self) -> bool:
@@ -90,9 +90,9 @@ class GuardedApproach:
         if self.stops < self.options.stops and (bool(observation.tactile.contact.any()) or len(links)):
             self.speed, self.time, self.feeling = CAREFUL_SPEED, 0.0, True
             self.retreat = min(self.left + 0.02, self.length)
-            self.touches = Touches(self.reference, links)
-            self.search = Localization(self.reference, self.displacement[:3])
-            self.touches.add(observation, self.palm - self.left * self.direction)
+            self.felt.append(Touches(self.reference, links))
+            self.search = Localization(self.reference, self.felt)
+            self.felt[-1].add(observation, self.palm - self.left * self.direction)
         else:
             braking = math.sqrt(2 * ACCELERATION * self.left)  # the speed from which the hand just stops in time
             fastest = CAREFUL_SPEED if self.careful else SPEED
@@ -117,9 +117,9 @@ class GuardedApproach:
         """Average the touch readings, then locate the object, then choose the palm's new goal: one stage per call."""
         if self.time < 0.06:  # [s]
             self.time += period
-            self.touches.add(observation, self.palm - self.left * self.direction)
-        elif not self.search.done and (bool(self.touches.felt.any()) or len(self.touches.links)):
-            self.search(self.touches)
+            self.felt[-1].add(observation, self.palm - self.left * self.direction)
+        elif not self.search.done and (bool(self.felt[-1].felt.any()) or len(self.felt[-1].links)):
+            self.search()
         else:
             self.feeling, self.careful, self.stops = False, True, self.stops + 1
             if self.search.done:
@@ -137,9 +137,9 @@ class GraspCheck:
     """Judge a pressing grasp: `judged` turns true when the result is known, `secure` says whether to lift.
 
     `displacement` holds the object's translation [m] and rotation [rad] that the closing estimated. If the plan has
-    table and surface, they are estimated anew from the touches; or if there are none, from those `before` the closing,
-    away from the places `visited` [m]. `palm` [m] is the palm's displacement from its plan. In the `last` attempt every
-    grasp counts as secure.
+    table and surface, they are estimated anew from all touches. These are `felt`, of which the last are those of the
+    closing; the touches of the pressing hand replace them. `palm` [m] is the palm's displacement from its plan. In the
+    `last` attempt every grasp counts as secure.
     """
 
     def __init__(
@@ -148,11 +148,10 @@ class GraspCheck:
         displacement: Float[Tensor, "6"],
         palm: Float[Tensor, "3"],
         last: bool,
-        before: Touches | None = None,
-        visited: Sequence[Float[Tensor, "3"]] = (),
+        felt: list[Touches],
     ) -> None:
         self.reference, self.palm, self.displacement = reference, palm, displacement
-        self.touches, self.before, self.visited = Touches(reference), before, visited
+        self.touches, self.felt = Touches(reference), felt
         self.known = reference.surface is not None and reference.table is not None
         self.search: Localization | None = None
         self.judged = self.secure = last
@@ -161,12 +160,13 @@ class GraspCheck:
         """Average the touches, locate the object, and judge the grasp once `pressed` [s] reaches `PRESSING_TIME`."""
         if self.judged or pressed < 0.1:
             return
-        touches, visited = (self.touches, ()) if bool(self.touches.felt.any()) else (self.before, self.visited)
         if pressed < 0.3:
             self.touches.add(observation, self.palm)
-        elif self.known and touches is not None and not (self.search and self.search.done):
-            self.search = self.search or Localization(self.reference, STILL, visited)
-            self.search(touches)
+        elif self.known and not (self.search and self.search.done):
+            if self.search is None and bool(self.touches.felt.any()):
+                self.felt[-1:] = [self.touches]
+            self.search = self.search or Localization(self.reference, self.felt)
+            self.search()
             self.displacement = self.search.displacement
         elif pressed >= PRESSING_TIME - 1e-9:
             self.touches.contact = observation.tactile.contact
