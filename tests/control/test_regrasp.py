@@ -122,9 +122,9 @@ def close(controller: GraspController, seen) -> int:
 
 @pytest.mark.parametrize("closing", ["uncertainty", "fixed"])
 def test_controller_closes_again_after_meeting_nothing(closing):
-    controller = GraspController(on_table(), closing)
+    controller = GraspController(on_table(), closing, options=ClosingOptions(attempts=2))
     ticks = close(controller, observation(0.02))
-    assert controller.attempts == ClosingOptions().attempts
+    assert controller.attempts == 2
     assert ticks * PERIOD < controller.attempts * (
         CLOSING_TIME + PRESSING_TIME + OPENING_TIME + 0.02 / PALM_SPEED + 0.3
     )
