@@ -47,7 +47,8 @@ class GuardedApproach:
     starts at its pre-grasp, and retreats first.
 
     `left` [m] is the remaining length of the approach, `palm` [m] the palm's displacement from its planned path,
-    `stops` the number of stops, whose touches are appended to `felt`. `displacement` holds the object's translation [m] and rotation [rad] at the last touch.
+    `stops` the number of stops. The touches of each stop are appended to `felt`. `displacement` holds the object's
+    translation [m] and rotation [rad] at the last touch.
     """
 
     def __init__(
