@@ -49,6 +49,26 @@ def test_what_one_fingertip_and_the_palm_carry_is_not_lost_until_it_drops():
         assert found is lost
 
 
+def slide(*speeds, height=0.02, noise=0.0):
+    """When [s] an object is lost that the hand carries, and along which its fingertips slide at some speeds [m/s]."""
+    check, generator = LiftCheck(on_table()), torch.Generator().manual_seed(2)
+    seen, up = observation(0.0, (1.0, 1.0, 1.0), TOUCHING), on_table().table.normal
+    for k in range(round(1.0 / PERIOD)):
+        sliding = torch.tensor(speeds).double() + noise * torch.randn(3, generator=generator, dtype=torch.float64)
+        tactile = dataclasses.replace(seen.tactile, forces=up.expand(3, 3).clone(), sliding=sliding)
+        if check(dataclasses.replace(seen, tactile=tactile), height, PERIOD):
+            return (k + 1) * PERIOD
+    return None
+
+
+def test_an_object_that_slides_along_two_fingertips_in_the_first_centimetres_will_be_lost():
+    assert slide(0.004, 0.0, 0.003) == pytest.approx(0.5, abs=1.5 * PERIOD)
+    assert slide(0.0, 0.02, 0.02) == pytest.approx(0.075, abs=1.5 * PERIOD)
+    assert slide(0.02, 0.0, 0.0) is None  # the object has settled, or turns about the others
+    assert slide(0.02, 0.02, 0.02, height=0.021) is None
+    assert slide(0.0, 0.0, 0.0, noise=0.002) is None
+
+
 def test_without_forces_or_table_the_touches_tell():
     binary = dataclasses.replace(on_table(), sensor=SensorModel("binary"))
     for reference in (binary, dataclasses.replace(on_table(), table=None)):

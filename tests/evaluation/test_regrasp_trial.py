@@ -12,12 +12,14 @@ from torchgrasp import Plane
 from torchgrasp.closure import ClosingOptions
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation import GraspTrial, Protocol, ProtocolResult, PullSpec, Truth, ViewScore, summarise
+from torchgrasp.evaluation.causes import tick_of
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import apply_error
 from torchgrasp.evaluation.pull import run_protocol
-from torchgrasp.evaluation.regrasp import _left_behind, lift_grasps, next_grasp
+from torchgrasp.evaluation.regrasp import _left_behind, lift_grasps, list_others, next_grasp
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
-from torchgrasp.values import Grasps
+from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.values import Contacts, Grasps
 
 TURNED = real([0.0, 0.0, 1.0])
 
@@ -50,20 +52,52 @@ def test_the_next_grasp_is_the_best_that_differs_from_all_tried():
     generator = torch.Generator().manual_seed(0)
     drawn = torch.rand(30, 3, generator=generator, dtype=torch.float64) * real([90.0, 0.03, 0.03])
     grasps, tried = several(*(placed(*row) for row in drawn.tolist())), [0]
-    while (found := next_grasp(grasps, tried)) is not None:
-        fresh = [k for k in range(30) if all(differs(grasps, k, other) for other in tried)]
-        assert found == fresh[0]
-        tried.append(found)
-    assert 2 < len(tried) < 30 and not any(all(differs(grasps, k, other) for other in tried) for k in range(30))
+    while len(others := list_others(grasps, tried)):
+        assert others.tolist() == [k for k in range(30) if all(differs(grasps, k, other) for other in tried)]
+        assert next_grasp(grasps, tried) == others[0]
+        tried.append(int(others[0]))
+    assert 2 < len(tried) < 30
+
+
+def rod_and_pinches(*places: float, scores: list[float]) -> tuple[Grasps, SignedDistanceField]:
+    """A rod of 200 mm along x, and pinches of it at some places along x [m], ranked by their log-odds."""
+    axes = [torch.arange(-30, 31), torch.arange(-8, 9), torch.arange(-8, 9)]
+    nodes = 0.004 * torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).double()
+    past = (nodes.abs() - real([0.1, 0.01, 0.01])).clamp_min(0.0).norm(dim=-1)
+    inside = (nodes.abs() - real([0.1, 0.01, 0.01])).amax(-1).clamp_max(0.0)
+    rod = SignedDistanceField(nodes[0, 0, 0], 0.004, past + inside)
+    grasps, points = several(*[placed()] * len(places)), real([[0.01, 0.01, 0], [-0.01, 0.01, 0], [0, -0.01, 0]])
+    contacts = Contacts(
+        torch.stack([points + real([x, 0.0, 0.0]) for x in places]),
+        real([[0, 1, 0], [0, 1, 0], [0, -1, 0]]).expand(len(places), 3, 3).clone(),
+    )
+    meta = {**grasps.meta, "ranking": "success", "friction": "0.8"}
+    return dataclasses.replace(grasps, contacts=contacts, score=real(scores), meta=meta), rod
+
+
+def test_a_failure_speaks_for_a_centre_of_mass_on_the_other_side():
+    scores = [1.0, 0.99, 0.98, 0.97, 0.96, 0.95]
+    grasps, rod = rod_and_pinches(0.05, 0.03, 0.07, 0.0, -0.05, -0.09, scores=scores)
+    assert next_grasp(grasps, [0], rod) == 4
+    assert next_grasp(grasps, [4], rod) == 0
+    assert next_grasp(grasps, [0], None) == next_grasp(dataclasses.replace(grasps, meta={}), [0], rod) == 1
+    unknown = dataclasses.replace(grasps, known=torch.tensor([True, True, True, False, False, False]))
+    assert next_grasp(unknown, [0], rod) in (1, 2)
+
+
+def test_among_equally_likely_grasps_the_one_far_from_the_failed_contacts_is_next():
+    grasps, rod = rod_and_pinches(0.0, 0.016, -0.016, -0.03, 0.06, scores=[1.0] * 5)
+    still = dataclasses.replace(grasps, score=real([1.0, 1.0, 1.0, 1.0, -9.0]))
+    assert next_grasp(still, [0], rod) == 3
 
 
 @pytest.mark.parametrize(("pose", "fresh"), [((29.0,), True), ((0.0, 0.014), False), ((0.0, 0.016), True)])
 def test_a_grasp_is_another_by_its_contacts_or_its_direction(pose, fresh):
     grasps = several(placed(), placed(*pose))
     points = grasps.contacts.points[[0, 0]]
-    assert next_grasp(grasps, [0]) == (1 if fresh else None)
+    assert list_others(grasps, [0]).tolist() == ([1] if fresh else [])
     still = dataclasses.replace(grasps, contacts=dataclasses.replace(grasps.contacts, points=points))
-    assert next_grasp(still, [0]) is None  # less than 30 degrees at the same contacts
+    assert len(list_others(still, [0])) == 0  # less than 30 degrees at the same contacts
 
 
 RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0, attempts=1)
@@ -78,7 +112,7 @@ def trial(*poses, **truth) -> GraspTrial:
 def test_a_trial_of_a_single_grasp_is_the_same_to_the_last_bit():
     pytest.importorskip("sapien")
     one = trial(placed())
-    ((_, found),) = lift_grasps(one, QUICK)
+    ((_, found),) = lift_grasps(one, QUICK, tries=1)
     ((_, first),) = lift_grasps(dataclasses.replace(one, grasp=several(placed(), MISSED)), QUICK, tries=1)
     assert digest(found) == digest(first) == digest(lift_grasp(one, QUICK))
 
@@ -99,7 +133,9 @@ def test_a_hand_that_closed_beside_the_object_holds_it_with_the_second_grasp(sim
 def test_a_held_object_is_not_tried_again_and_the_last_try_ends_the_trial():
     pytest.importorskip("sapien")
     ((_, held),) = lift_grasps(trial(placed(), placed(90.0)), STILL)
-    assert held.held
+    height = held.hand_pose[:, 2, 3] - held.hand_pose[tick_of(held, 2), 2, 3]
+    low = height[(held.time - held.phases[2] - 1.0).abs().argmin()]  # the hand has risen slowly, and fast from then on
+    assert held.held and float(low) == pytest.approx(0.02, abs=1e-3) and float(height[-1]) > 0.095
     failed = run_protocol(trial(MISSED, placed(0.0, 0.35), placed()), Protocol("twice", STILL, tries=2))
     assert (failed.passed, failed.tries, failed.status) == (False, 2, Status.NO_CONTACT)
 

@@ -227,10 +227,11 @@ class Reopening:
 
 
 class LiftCheck:
-    """Feel while a closed hand rises whether it has lost the object; `lost` then stays true.
+    """Feel while a closed hand rises, and holds, whether it loses the object; `lost` then stays true.
 
-    The object is lost if fewer than two fingertips touch, and these carry hardly any load along the table's normal.
-    Only touches count for binary sensors, or without a table. Broken sensors count as touching.
+    The object is lost if fewer than two fingertips touch, and these carry hardly any load along the table's normal. The
+    hand will lose the object if two fingertips slide along it before the hand has risen to the height `low` [m]. Only
+    touches count for binary sensors, or without a table. Broken sensors count as touching.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.control import no_contact, observe
@@ -240,21 +241,27 @@ class LiftCheck:
     True
     """
 
+    low = 0.02
+
     @checked
     def __init__(self, reference: ClosingReference) -> None:
         self.alive, self.lost, self.load = reference.alive, False, 0.0
+        self.slid = torch.zeros(len(self.alive), dtype=torch.float64)  # by each fingertip [m]
         self.table = None if reference.sensor.kind == "binary" else reference.table
 
     @checked
     def __call__(self, observation: Observation, height: float, period: Annotated[float, Range(1e-5, 1.0)]) -> bool:
         """Return `lost` at the end of a tick of `period` [s], in which the hand has risen to `height` [m]."""
-        least, first = 0.2, 0.01  # load [N], and height [m] from which the hand is judged
+        least, first, slip = 0.2, 0.01, 0.0015  # load [N], height [m] from which touches count, slide [m]
         tactile = observation.tactile
+        if height <= self.low:
+            self.slid = self.slid + period * tactile.sliding
         if self.table is not None:
             load = float((tactile.forces @ self.table.normal.double()).sum())
             self.load += low_pass(3.0, period) * (load - self.load)
         slack = int((tactile.contact | ~self.alive).sum()) < 2 and self.load < least
-        self.lost = self.lost or (slack and height >= first)
+        slides = float(self.slid.sort().values[-2]) > slip
+        self.lost = self.lost or (slack and height >= first) or slides
         return self.lost
 
 

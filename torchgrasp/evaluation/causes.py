@@ -12,7 +12,6 @@ from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
-from torchgrasp.evaluation.lift import LIFT_TIME
 from torchgrasp.evaluation.regrasp import LiftTry
 from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
@@ -74,7 +73,8 @@ def _sizes(lift: ClosureResult, trial: GraspTrial, spec: TrialSpec) -> Iterator[
     yield "too weak", float(lift.forces[pressed].max()) if weak else math.nan, -1.0
     slid, turned = (motion[pressed:] for motion in moved_in_hand(lift, centre))
     lost = (slid >= SLIP_DISTANCE) | (turned >= SLIP_ANGLE)
-    first, risen = int(lost.int().argmax()), int((lift.time <= lift.time[pressed] + LIFT_TIME).sum()) - 1 - pressed
+    first, heights = int(lost.int().argmax()), (lift.hand_pose[pressed:, :3, 3] - lift.hand_pose[pressed, :3, 3]) @ up
+    risen = int((heights >= spec.lift_height - 1e-3).int().argmax()) or -1
     yield "dropped when pushed", math.nan if bool(lost[risen]) else math.hypot(*spec.push), 0.0
     rotates = bool(lost[first]) and bool(slid[first] < SLIP_DISTANCE)
     yield "turned", math.degrees(turned.max()) if rotates else math.nan, 0.0

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.checks import Count, checked
@@ -24,6 +24,8 @@ from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.ik.ranking import log_odds_about
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Neighbour
 from torchgrasp.specs import TrialSpec
@@ -32,13 +34,48 @@ from torchgrasp.values import Grasps
 
 
 @checked
-def next_grasp(grasps: Grasps, tried: Sequence[int]) -> int | None:
-    """Return the best-ranked grasp that differs from those `tried`: by 30 degrees in approach, or 15 mm in contacts."""
-    points, approach, others = grasps.contacts.points, grasps.approach, list(tried)
-    gaps = torch.linalg.vector_norm(points[:, None] - points[others], dim=-1).mean(-1)
-    differs = (gaps > 0.015) | (approach @ approach[others].T < math.cos(math.radians(30)))
-    fresh = differs.all(-1).nonzero()
-    return int(fresh[0]) if len(fresh) else None
+def next_grasp(grasps: Grasps, tried: Sequence[int], surface: SignedDistanceField | None = None) -> int:
+    """Return the grasp of `list_others` that most likely holds, given that those `tried` have failed.
+
+    Without an estimated surface and table, or in another ranking than by success, it is the best-ranked one.
+    """
+    others = list_others(grasps, tried)
+    if surface is None or grasps.table is None or grasps.meta.get("ranking") != "success":
+        return int(others[0])
+    return int(others[_chances(grasps, grasps.table, surface, tried)[others].argmax()])
+
+
+@checked
+def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
+    """Return the rows of the grasps that differ from all `tried`: by 30 degrees in approach, or 15 mm in contacts."""
+    approach = grasps.approach
+    differs = (_gaps(grasps, tried) > 0.015) | (approach @ approach[list(tried)].T < math.cos(math.radians(30)))
+    return differs.all(-1).nonzero()[:, 0]
+
+
+def _gaps(grasps: Grasps, tried: Sequence[int]) -> Float[Tensor, "g t"]:
+    """Return the mean distance [m] of the contacts of each grasp from those of each tried grasp."""
+    points = grasps.contacts.points.double()
+    return torch.linalg.vector_norm(points[:, None] - points[list(tried)], dim=-1).mean(-1)
+
+
+def _chances(
+    grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]
+) -> Float[Tensor, "g"]:
+    """Return each grasp's probability of success given that the tried ones failed; 0 if it is unknown.
+
+    A share of the mass may be at any point of the surface, which may explain the failures. Besides, log-odds fall near
+    the contacts of the tried grasps.
+    """
+    share, count, fall, width = 0.35, 64, 2.0, 0.04  # of mass; places; of log-odds; [m]
+    shell = (surface.values.abs() < surface.spacing).nonzero().double()
+    places = surface.origin.double() + surface.spacing * shell[:: max(1, len(shell) // count)]
+    middle = places.mean(0)
+    centers = torch.cat([middle[None], middle + share * (places - middle)])
+    log_odds = log_odds_about(grasps, centers, float(grasps.meta["friction"]), (-table.normal).tolist())
+    weight = torch.sigmoid(-log_odds[list(tried)]).prod(0)
+    log_odds = log_odds - fall * torch.exp(-0.5 * (_gaps(grasps, tried) / width) ** 2).sum(-1, keepdim=True)
+    return (torch.sigmoid(log_odds) @ weight / weight.sum()).where(grasps.success > 0, 0.0)
 
 
 class LiftTry(NamedTuple):
@@ -53,9 +90,9 @@ class LiftTry(NamedTuple):
 def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3) -> tuple[LiftTry, ...]:
     """Lift an object with the first grasp of a trial, and with others where a lift fails; return all tries.
 
-    Where the hand feels that the object stays behind (`LiftCheck`) or is too heavy, the hand goes down, opens and
-    withdraws. The object stays where it then is. The robot expects it where the touches of the last try tell, or looks
-    once more, and tries the grasp of `next_grasp`.
+    With several tries the hand rises slowly at first. Where the hand feels that the object slides or stays behind
+    (`LiftCheck`), or is too heavy, the hand goes down, opens and withdraws. The object stays where it then is. The robot
+    expects it where the touches of the last try tell, or looks once more, and tries the grasp of `next_grasp`.
 
     Args:
         trial: the trial, with grasps in the order of preference; the truth's `error` is that of the first grasp.
@@ -78,34 +115,32 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
 
 def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry, ...]:
     """Run the trial of the first of several grasps, and trials of others where a lift fails."""
-    spec, tried, done = driver.spec, [0], []
-    while True:
-        following = next_grasp(grasps, tried) if len(tried) < tries else None
-        if following is None:  # the last try lifts whatever it feels
-            return *done, LiftTry(tried[-1], run_lift(driver))
+    tried, done = [0], list[LiftTry]()
+    while len(tried) < tries and len(list_others(grasps, tried)):
         lift, started = _CheckedLift(driver.open()), time.perf_counter()
         result = lift.result(lift.perform(), time.perf_counter() - started)
         done.append(LiftTry(tried[-1], result))
         if not (lift.check.lost or result.status is Status.TOO_HEAVY):
             return tuple(done)
-        tried.append(following)
-        trial, pose = driver.trial, grasps.obj_from_hand[following].to("cpu", torch.float64)
-        truth = _left_behind(trial, result, _felt(lift.run.controller), pose)
-        seed = seed_of(trial.seed, "again")
-        driver = TrialDriver(dataclasses.replace(trial, grasp=grasps[following], truth=truth, seed=seed), spec)
+        trial, controller = driver.trial, lift.run.controller
+        row = next_grasp(grasps, tried, trial.surface)
+        truth = _left_behind(trial, result, _felt(controller), grasps.obj_from_hand[row].to("cpu", torch.float64))
+        trial = dataclasses.replace(trial, grasp=grasps[row], truth=truth, seed=seed_of(trial.seed, "again"))
+        tried, driver = [*tried, row], TrialDriver(trial, driver.spec)
+    return *done, LiftTry(tried[-1], run_lift(driver, LiftCheck.low if tries > 1 else 0.0))  # the last try lifts whatever it feels
 
 
 class _CheckedLift(_Lift):
     """A lift that ends where the hand feels that it has lost the object."""
 
     def __init__(self, run: TrialRun) -> None:
-        super().__init__(run)
+        super().__init__(run, LiftCheck.low)
         self.check = LiftCheck(run.robot.reference)
 
     def _gives_up(self, height: float) -> bool:
-        """Return whether the object is too heavy or, while the hand rises, lost."""
-        rising = height < self.spec.lift_height
-        lost = rising and self.check(self.run.observation, height, self.run.robot.period)
+        """Return whether the object is too heavy or, before it is pushed, lost."""
+        alone = height < self.spec.lift_height or not any(self.spec.push)
+        lost = alone and self.check(self.run.observation, height, self.run.robot.period)
         return super()._gives_up(height) or lost
 
     def _put_down(self, time: float, rising: float) -> Status:

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -143,10 +144,32 @@ def success_features(
     least_lever = finger_levers(hand, grasps).amin(1).to(points)
     free, straight = 0.07, 0.01  # [m] more lever is no better; keeps the logarithm of a straight finger finite
     lever = torch.log((least_lever.clamp_max(free) + straight) / (free + straight))
+    carried = _log_carried(contacts, forces, center, friction, weight).to(points)
+    return torch.stack([closure, least / math.atan(friction), arm, lever, carried], dim=-1)
+
+
+def _log_carried(
+    contacts: Contacts, forces: Float[Tensor, "g f 3"], center: Float[Tensor, "3"], friction: float,
+    weight: Sequence[float],
+) -> Float[Tensor, "g"]:  # fmt: skip
+    """Return the last of the `FEATURES`: the log of the force that carries the load at half of the friction."""
     push = 0.0 if any(weight) else 1.0
     carried = carrying_force(contacts, forces, center, 0.5 * friction, center.new_tensor(weight), push)
-    carried = torch.log(carried.clamp(0.3, 100.0)).to(points)
-    return torch.stack([closure, least / math.atan(friction), arm, lever, carried], dim=-1)
+    return torch.log(carried.clamp(0.3, 100.0))
+
+
+def log_odds_about(
+    grasps: Grasps, centers: Float[Tensor, "c 3"], friction: float, weight: Sequence[float]
+) -> Float[Tensor, "g c"]:
+    """Return the log-odds of success of grasps for other centres of mass [m] than the first, for which they are ranked.
+
+    Only the force that carries the load depends on the centre.
+    """
+    points, normals = grasps.contacts.points.to(centers), grasps.contacts.normals.to(centers)
+    forces = least_friction_forces(points, normals, strongest=1.0)
+    carried = [_log_carried(grasps.contacts, forces, center, friction, weight) for center in centers]
+    change = torch.stack(carried, -1) - carried[0][:, None]
+    return grasps.score.to(centers)[:, None] + _read_model()["weights"][FEATURES[-1]] * change
 
 
 @functools.cache
