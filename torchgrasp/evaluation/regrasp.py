@@ -59,9 +59,7 @@ def _gaps(grasps: Grasps, tried: Sequence[int]) -> Float[Tensor, "g t"]:
     return torch.linalg.vector_norm(points[:, None] - points[list(tried)], dim=-1).mean(-1)
 
 
-def _chances(
-    grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]
-) -> Float[Tensor, "g"]:
+def _chances(grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]) -> Float[Tensor, "g"]:
     """Return each grasp's probability of success given that the tried ones failed; 0 if it is unknown.
 
     A share of the mass may be at any point of the surface, which may explain the failures. Besides, log-odds fall near
@@ -127,7 +125,9 @@ def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry,
         truth = _left_behind(trial, result, _felt(controller), grasps.obj_from_hand[row].to("cpu", torch.float64))
         trial = dataclasses.replace(trial, grasp=grasps[row], truth=truth, seed=seed_of(trial.seed, "again"))
         tried, driver = [*tried, row], TrialDriver(trial, driver.spec)
-    return *done, LiftTry(tried[-1], run_lift(driver, LiftCheck.low if tries > 1 else 0.0))  # the last try lifts whatever it feels
+    return *done, LiftTry(
+        tried[-1], run_lift(driver, LiftCheck.low if tries > 1 else 0.0)
+    )  # the last try lifts whatever it feels
 
 
 class _CheckedLift(_Lift):
