@@ -89,8 +89,8 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
     """Lift an object with the first grasp of a trial, and with others where a lift fails; return all tries.
 
     With several tries the hand rises slowly at first. Where the hand feels that the object slides or stays behind
-    (`LiftCheck`), or is too heavy, the hand goes down, opens and withdraws. The object stays where it then is. The robot
-    expects it where the touches of the last try tell, or looks once more, and tries the grasp of `next_grasp`.
+    (`LiftCheck`), or is too heavy, the hand goes down, opens and withdraws. The object stays where it then is. The
+    robot expects it where the touches of the last try tell, or looks once more, and tries the grasp of `next_grasp`.
 
     Args:
         trial: the trial, with grasps in the order of preference; the truth's `error` is that of the first grasp.
