@@ -7,6 +7,7 @@ Settings that differ from SAPIEN's defaults:
 * Sleeping is off, because a sleeping body keeps stale contacts.
 * The object's inertia is set with its mass.
 * Penetrations are resolved at 1 m/s at most.
+* The solver iterates 32 times a step: with 10 iterations a held object creeps, far inside the friction cones.
 * Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its own.
 """
 
@@ -36,7 +37,7 @@ def open_world(sapien: Any, physx: Any, gravity: float, timestep: float) -> tupl
     """Return an empty physics system and its scene, with given gravity [m/s^2] and timestep [s]."""
     physx.set_scene_config(gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=True, enable_pcm=True)
     physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
-    physx.set_body_config(solver_position_iterations=10, solver_velocity_iterations=1, sleep_threshold=0.0)
+    physx.set_body_config(solver_position_iterations=32, solver_velocity_iterations=1, sleep_threshold=0.0)
     system = physx.PhysxCpuSystem()
     scene = sapien.Scene([system])
     scene.timestep = timestep
