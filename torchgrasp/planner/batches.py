@@ -69,7 +69,7 @@ def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
     for spec in (given, *relaxed):
         failed.clear()
         if spec is not given:
-            problem = dataclasses.replace(problem, given_spec=spec)
+            problem = problem.replace("flat", given_spec=spec)  # nothing else depends on what is relaxed
         for grasps in Planner(problem).run(deadline):
             good = grasps[executable(grasps)]
             failed.append(grasps)

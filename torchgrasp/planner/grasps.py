@@ -196,10 +196,10 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
     best, observer = None, problem.request.observer
     for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
         stages = list[tuple[str, str, Any]]()
-        own = problem.for_hand(hand, lambda *stage: stages.append(stage))  # noqa: B023 called at once
+        problem = problem.for_hand(hand, lambda *stage: stages.append(stage))  # noqa: B023 called at once
         now = time.monotonic()
-        batches = list(plan_hand(own, now + (deadline - now) / left))
-        grasps = own.give_back(rank_together(batches, problem.request.order))
+        batches = list(plan_hand(problem, now + (deadline - now) / left))
+        grasps = problem.give_back(rank_together(batches, problem.request.order))
         expected, count = expected_success(grasps), int((grasps.status == Status.OK).sum())
         observer("fingers", f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected", grasps)
         if best is None or expected > best[0]:

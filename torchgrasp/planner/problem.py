@@ -172,7 +172,13 @@ class Problem:
     def for_hand(self, hand: Hand, observer: Observer) -> "Problem":
         """Return the problem for a hand with another set of fingers, and with another observer."""
         request = dataclasses.replace(self.request, observer=observer)
-        return dataclasses.replace(self, request=request, hand=settle(hand, self.shape.device))
+        return self.replace("flat", "library", request=request, hand=settle(hand, self.shape.device))
+
+    def replace(self, *dropped: str, **changes: Any) -> "Problem":
+        """Return the problem with changed fields; it keeps all derived values except those `dropped`."""
+        problem = dataclasses.replace(self, **changes)
+        vars(problem).update((name, x) for name, x in vars(self).items() if name not in (*changes, *dropped))
+        return problem
 
     @cached_property
     def flat(self) -> Settled:
@@ -278,12 +284,7 @@ class Problem:
 
 @checked
 def take_target(scene: Scene, seed: Seed) -> PointCloud:
-    """Return the point cloud of a scene's target: at most `TARGET_POINTS` random points.
-
-    Raises:
-        BadArgument: the scene has no target, or no object has the target's label.
-        TooFewPoints: fewer than 4 points.
-    """
+    """Return at most `TARGET_POINTS` random points of a scene's target, which must be the label of an object."""
     if scene.target not in scene.things:
         raise BadArgument("target", scene.target, f"one of the labels {list(scene.things)}: scene.select(label)")
     cloud, generator = scene.cloud(), torch.Generator().manual_seed(seed)
