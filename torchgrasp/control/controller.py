@@ -184,7 +184,7 @@ class GraspController:
         guard(observation, period)
         if guard.done:
             self.guard, self.stops = None, self.stops + guard.stops
-            if guard.careful and isinstance(self.closing, UncertaintyClosing):
+            if (guard.stops or self.attempts > 1) and isinstance(self.closing, UncertaintyClosing):
                 self.closing.begin_at(guard.displacement, guard.palm)
         return Targets(self.targets.joints, self.path + guard.palm, guard.left)
 

@@ -21,8 +21,7 @@ from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
 
-SPEED, CAREFUL_SPEED, ACCELERATION = 0.2, 0.08, 1.0
-"""Largest speed [m/s] of the approach, largest speed [m/s] after a touch, and acceleration [m/s^2]."""
+SPEED, ACCELERATION = 0.1, 1.0  # largest speed [m/s] of the approach, and its acceleration [m/s^2]
 
 PRESSING_TIME = 0.5  # time [s] from the end of closing until the hand counts as closed, and is judged
 
@@ -60,7 +59,7 @@ class GuardedApproach:
         self.left, self.speed, self.retreat, self.stops = length, 0.0, 0.0, 0
         self.palm, self.goal, self.displacement = STILL, STILL, torch.zeros(6, dtype=torch.float64)
         self.time, self.feeling = 0.0, False
-        self.careful, self.rest, self.inertia = after is not None, None, torch.zeros_like(reference.kp)
+        self.rest, self.inertia = None, torch.zeros_like(reference.kp)
         if after is not None:
             self.left, self.palm = 0.0, after.palm
             self._turn_to(after.displacement)
@@ -89,15 +88,14 @@ class GuardedApproach:
         """Move on towards the pre-grasp, or stop at a touch of a fingertip or of another link."""
         links = self._touching_links(observation)
         if self.stops < self.options.stops and (bool(observation.tactile.contact.any()) or len(links)):
-            self.speed, self.time, self.feeling = CAREFUL_SPEED, 0.0, True
+            self.speed, self.time, self.feeling = SPEED, 0.0, True
             self.retreat = min(self.left + 0.02, self.length)
             self.felt.append(Touches(self.reference, links))
             self.search = Localization(self.reference, self.felt)
             self.felt[-1].add(observation, self.palm - self.left * self.direction)
         else:
             braking = math.sqrt(2 * ACCELERATION * self.left)  # the speed from which the hand just stops in time
-            fastest = CAREFUL_SPEED if self.careful else SPEED
-            self.speed = min(self.speed + ACCELERATION * period, fastest, max(braking, ACCELERATION * period))
+            self.speed = min(self.speed + ACCELERATION * period, SPEED, max(braking, ACCELERATION * period))
             self.left = max(self.left - self.speed * period, 0.0)
 
     def _touching_links(self, observation: Observation) -> Float[Tensor, "m 4"]:
@@ -122,7 +120,7 @@ class GuardedApproach:
         elif not self.search.done and (bool(self.felt[-1].felt.any()) or len(self.felt[-1].links)):
             self.search()
         else:
-            self.feeling, self.careful, self.stops = False, True, self.stops + 1
+            self.feeling, self.stops = False, self.stops + 1
             if self.search.done:
                 self._turn_to(self.search.displacement)
 
