@@ -180,7 +180,8 @@ class TrialSpec(Value):
             squeeze.
         holding: how the closed hand presses: "force" (balanced forces), "grip" (the forces that the felt load and a
             push of 2.5 N need), "impedance" (the grasp is a spring in the hand), "position" (joint targets are kept) or
-            "law" (Eq. 25 continues). In open loop the squeeze is kept.
+            "law" (Eq. 25 continues). In open loop the squeeze is kept. None means "grip", or "force" if `force` is
+            given, the closing is not "uncertainty" or "fixed", or a fingertip is not tactile.
         options: components of the closing "uncertainty" or "fixed"; by default all components.
         sensor: sensors of the fingertips; the controller knows their kind.
         max_force: largest normal force [N] of a fingertip; None means no limit.
@@ -194,7 +195,7 @@ class TrialSpec(Value):
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         push: force [N] at the object's centre of mass during the hold, in the world's axes, whose z axis points up.
         force: normal force of the strongest finger [N] in the closing and in the holding "force"; None means 4 N, or
-            `max_force` if it is less. The holding "grip" finds its forces itself.
+            `max_force` if it is less.
         noise: whether the sensor is noisy; for a tactile sensor 0.1 N normal, 0.3 N tangential and 1.5 mm of position.
         timestep: timestep of the simulator [s].
         control_rate: rate of the controller [Hz].
@@ -210,12 +211,12 @@ class TrialSpec(Value):
         BadArgument: a number outside its range, an unknown closing, holding or simulator, options of a closing that
             has none, a sensor or force that the closing cannot use, or a control period below one timestep.
 
-    >>> TrialSpec(closing="open_loop", mass=0.3).holding
-    'force'
+    >>> TrialSpec(mass=0.3).pressing, TrialSpec(force=6.0).pressing
+    ('grip', 'force')
     """
 
     closing: ClosingMode = "uncertainty"
-    holding: HoldingMode = "force"
+    holding: HoldingMode | None = None
     mass: Annotated[float, Range(0.001, 10.0)] = 0.1
     friction: Annotated[float, Range(0.0, 10.0)] = 0.8
     gravity: Annotated[float, Range(0.0, 100.0)] = 9.81
@@ -243,7 +244,7 @@ class TrialSpec(Value):
     def __post_init__(self) -> None:
         """Raise `BadArgument` if fields contradict each other."""
         choose_options(self.closing, self.options)
-        check_modes(self.sensor, self.closing, self.holding)
+        check_modes(self.sensor, self.closing, self.pressing)
         if self.max_force is not None and self.force is not None and self.force > self.max_force:
             raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
         if self.table_friction is not None and self.table_friction > self.friction:
@@ -255,6 +256,12 @@ class TrialSpec(Value):
             raise BadArgument("control_rate", found, "a period of at least one timestep")
 
     @property
+    def pressing(self) -> HoldingMode:
+        """The holding, also where the field `holding` is None."""
+        default = default_holding(self.sensor, self.closing) if self.force is None else "force"
+        return self.holding or default
+
+    @property
     def strongest(self) -> float:
         """The normal force [N] of the strongest finger in the closing and in the holding "force"."""
         return min(4.0, self.max_force or 4.0) if self.force is None else self.force
@@ -263,6 +270,11 @@ class TrialSpec(Value):
     def components(self) -> ClosingOptions:
         """The options of the closing mode; all are off for a mode that has no options."""
         return choose_options(self.closing, self.options)
+
+
+def default_holding(sensor: SensorModel, closing: ClosingMode) -> HoldingMode:
+    """Return the holding "grip", or "force" after closings without tactile fingertips or without `ClosingOptions`."""
+    return "grip" if sensor.full and closing in ("fixed", "uncertainty") else "force"
 
 
 def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:

@@ -10,7 +10,7 @@ from torchgrasp import TrialSpec
 from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.controller import CLOSING_TIME, GraspController
 from torchgrasp.control.forces import desired_forces
-from torchgrasp.control.holding import RAMP, ForceHold, held_forces
+from torchgrasp.control.holding import RAMP, ForceHold, GripHold, held_forces
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.control.recovery import PRESSING_TIME
 from torchgrasp.errors import BadArgument
@@ -100,14 +100,14 @@ def test_open_loop_passes_its_three_poses():
     assert controller.closed
 
 
-@pytest.mark.parametrize("closing", ["position", "fixed", "uncertainty"])
-def test_controller_ends_the_closing_in_time_and_holds(closing):
+@pytest.mark.parametrize(("closing", "hold"), [("position", ForceHold), ("fixed", GripHold), ("uncertainty", GripHold)])
+def test_controller_ends_the_closing_in_time_and_holds(closing, hold):
     controller, period = GraspController(reference(), closing), 0.02
     for _ in range(round(CLOSING_TIME / period)):
         controller.step(observation(0.05), period)
     assert controller.hold is None
     controller.step(observation(0.05), period)
-    assert isinstance(controller.hold, ForceHold) and not controller.closed
+    assert isinstance(controller.hold, hold) and not controller.closed
     for _ in range(round(PRESSING_TIME / period)):
         controller.step(observation(0.05), period)
     assert controller.closed

@@ -209,7 +209,8 @@ def test_a_start_in_the_object_missing_contact_and_too_little_friction_are_named
     missed = lift_grasp(GraspTrial(hand, grasp, Truth(cylinder((0.4, 0.0)))), spec)
     assert (missed.status, missed.contact_order) == (Status.NO_CONTACT, ())
     slippery = close("allegro", spec=dataclasses.replace(spec, friction=0.02))
-    assert slippery.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED) and not slippery.held
+    lost = Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED, Status.TOO_HEAVY
+    assert slippery.status in lost and not slippery.held
 
 
 @pytest.mark.parametrize(("friction", "simulator"), [(0.4, "sapien"), (0.8, "sapien"), (0.4, "mujoco")])
@@ -220,6 +221,7 @@ def test_the_fingers_carry_the_weight_that_friction_allows(simulator, friction, 
     gains = derive_reference(*pinch("allegro")).gains
     most = friction * float(gains.desired_force.norm(dim=-1).sum()) / 9.81
     spec = dataclasses.replace(STILL, approach=0.0, friction=friction, mass=share * most, simulator=simulator)
+    spec = dataclasses.replace(spec, holding="force")
     found = close("allegro", spec=spec)
     assert found.held is held and (held or found.status in (Status.NOT_LIFTED, Status.DROPPED))
 

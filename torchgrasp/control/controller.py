@@ -24,7 +24,7 @@ from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equa
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rigid
 from torchgrasp.hand.hand import Hand
-from torchgrasp.specs import ClosingMode, HoldingMode, check_modes
+from torchgrasp.specs import ClosingMode, HoldingMode, check_modes, default_holding
 from torchgrasp.values import PointCloud
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
@@ -51,6 +51,7 @@ class GraspController:
     Args:
         reference: the closing plan.
         closing, holding, options: modes of closing and holding, and options of the closing, as in `TrialSpec`.
+            The holding None means "grip", or "force" where the closing or the sensor does not allow it.
         approach: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
 
     Raises:
@@ -74,11 +75,12 @@ class GraspController:
         self,
         reference: ClosingReference,
         closing: ClosingMode = "uncertainty",
-        holding: HoldingMode = "force",
+        holding: HoldingMode | None = None,
         options: ClosingOptions | None = None,
         approach: Annotated[float, Range(0.0, 1.0)] = 0.0,
     ) -> None:
         self.options = choose_options(closing, options)
+        holding = holding or default_holding(reference.sensor, closing)
         check_modes(reference.sensor, closing, holding)
         if approach and not (self.options.stops and can_guard(reference)):
             allowed = "0 without stops, or without a table, a surface and a direction in the reference"

@@ -184,7 +184,8 @@ class GripHold:
         load = self._weight(contacts.wrench @ forces.ravel())
         self.load = self.load + low_pass(3.0, period) * (load - self.load)
         self.carried = self.carried + low_pass(0.7, period) * (load - self.carried)  # a faster one rocks the object
-        push = self.cover * (PUSH + self.unfelt)
+        sure = min(max(4.0 * (self.time - 0.4), 0.0), 1.0)  # earlier the hand may still reopen beside the object
+        push = self.cover * sure * (PUSH + self.unfelt)
         reserve = push * push_reserve(contacts, self.normals, self.centre - points.mean(0), self.aim)
         return contacts, self._bounded(reserve)
 

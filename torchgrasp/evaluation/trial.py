@@ -173,7 +173,7 @@ class TrialRun:
             None if slide is None else (driver.obj_from_world[:3, :3].T @ slide.to("cpu", torch.float64)).numpy()
         )
         guarded = spec.approach if spec.components.stops and can_guard(driver.reference) else 0.0
-        self.controller = GraspController(driver.reference, spec.closing, spec.holding, spec.options, guarded)
+        self.controller = GraspController(driver.reference, spec.closing, spec.pressing, spec.options, guarded)
         scene_spec = driver.scene_spec if trial.truth.camera is None else self._relook(driver, trial.truth.camera)
         self.scene = open_scene(scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
