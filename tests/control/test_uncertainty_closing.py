@@ -1,6 +1,7 @@
 """The closings: when fingers approach, wait, search, stop and press, and the paper's control law (Eqs. 25-28)."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -23,8 +24,16 @@ from torchgrasp.closure import NO_OPTIONS, ClosingOptions
 from torchgrasp.control import ClosingReference, GraspController
 from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, position_gain, surface_covariance
 from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing, PositionClosing
+from torchgrasp.control.reference import next_target
 from torchgrasp.control.sensing import WAITING_FORCE
-from torchgrasp.control.uncertainty_closing import LEAD, PATIENCE, QUICK_TOUCH, UncertaintyClosing, with_equal_gains
+from torchgrasp.control.uncertainty_closing import (
+    LEAD,
+    PATIENCE,
+    QUICK_TOUCH,
+    UncertaintyClosing,
+    rim_contacts,
+    with_equal_gains,
+)
 
 ONE, TWO = torch.tensor([True, False, False]), torch.tensor([True, True, False])
 RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0)
@@ -142,6 +151,35 @@ def test_searching_finger_stays_above_the_table(up):
     assert float(height[above].min()) >= 0 and float(height[above].max()) < 1e-3
     assert float(tips["free"][above].max()) < table.offset
     assert float(tips["low"][~above].min()) > float(-0.03 + 0.01)
+
+
+def test_fingers_slide_along_the_table_to_the_rim_of_a_low_object():
+    """Tips of 10 mm on the table touch a sharp rim 5 mm high with normals of slope 1/2; walls are met as before."""
+    slope = torch.tensor([0.5, 0.5, 0.5]).double()
+    normals = torch.stack([(1 - slope**2).sqrt() * NORMALS[:, 0], 0 * slope, slope], -1)
+    rim = TARGET * real([1.0, 1.0, 0.0]) + real([0.0, 0.0, 0.005])
+    gains = dataclasses.replace(GAINS, target=rim, covariance=surface_covariance(normals, real([0.004] * 3)))
+    low = dataclasses.replace(reference(), normals=normals, gains=gains, table=Plane(real([0, 0, 1]), 0.0))
+    law, joints, paths = UncertaintyClosing(low, RIGID_ARM), torch.zeros(9).double(), []
+    assert law.low.all() and not rim_contacts(dataclasses.replace(low, table=None)).any()
+    assert not rim_contacts(dataclasses.replace(low, normals=NORMALS)).any()
+    for _ in range(150):
+        paths.append(rim + 0.01 * normals + real([0, 0, 0.006]) + 0.012 * NORMALS + joints.reshape(3, 3))
+        joints = law(dataclasses.replace(observation(joints=joints), tips=paths[-1]), PERIOD)
+    height, left = torch.stack(paths)[..., 2] - 0.01, ((torch.stack(paths) - rim) * NORMALS).sum(-1)
+    touch = 0.01 * math.sqrt(0.75)  # horizontal distance [m] of a tip's centre from the rim that it touches
+    assert float(height.min()) > 0 and float(left.min()) < touch
+    assert float(height[left < touch + 0.003].max()) < 0.0005  # so low even where the rim is met 3 mm early
+
+
+def test_joints_that_would_be_too_fast_slow_down_together():
+    velocity = real([[2.0, 1.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    free, slow = (
+        next_target(reference(), torch.zeros(9).double(), velocity, observation(), 10.0, PERIOD, *fastest)
+        for fastest in ((), (0.8,))
+    )
+    assert float(slow.abs().max()) == pytest.approx(0.8 * PERIOD)
+    assert torch.allclose(slow * float(free.abs().max() / slow.abs().max()), free)
 
 
 def test_touching_finger_is_force_controlled_and_held_with_the_desired_forces():

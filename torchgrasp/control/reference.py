@@ -191,10 +191,15 @@ def next_target(
     observation: Observation,
     lead: Float[Tensor, " h"] | float,
     period: float,
+    fastest: float = math.inf,
 ) -> Float[Tensor, " h"]:
-    """Return the target of the actuated joints [rad] one tick later, at most `lead` [rad] off the measured joints."""
+    """Return the target of the actuated joints [rad] one tick later, at most `lead` [rad] off the measured joints.
+
+    No target moves faster than `fastest` [rad/s]: all joints slow down together, so tips keep their directions.
+    """
     jacobian = observation.jacobian @ reference.hand.actuated.coupling
     step = law.joint_step(jacobian, velocity, period, reference.joints - target)
+    step = step * min(1.0, fastest * period / max(float(step.abs().max()), 1e-9))
     joints = reference.pick(observation.joints)
     return reference.clamp(torch.minimum(torch.maximum(target + step, joints - lead), joints + lead))
 

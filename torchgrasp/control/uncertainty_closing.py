@@ -1,6 +1,7 @@
 """The default closing: a control law like the paper's, extended where the object is not where it was seen."""
 
 import dataclasses
+import math
 
 import torch
 from jaxtyping import Bool, Float
@@ -35,6 +36,7 @@ class UncertaintyClosing:
     * Before the first touch the fingers keep pace: all reach their contacts at the same time.
     * A finger without a working sensor rests at its estimated contact until the others touch. Then it searches until
       its drives feel a contact, or until it is three standard deviations beyond the contact.
+    * Fingertips whose contacts are on the rim of a low object go down to the table, and slide along it to the object.
     * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers close.
     """
 
@@ -49,6 +51,7 @@ class UncertaintyClosing:
         self.strongest, self.target = strongest_lead(reference), reference.pregrasp
         self.share = torch.zeros_like(reference.normals[:, 0])
         self.waiting, self.settled = 0.0, Settled(reference)
+        self.low = rim_contacts(reference)
 
     @property
     def done(self) -> bool:
@@ -94,9 +97,11 @@ class UncertaintyClosing:
         if reference.table is not None:
             height = reference.table.height(tips) - reference.hand.tips.radius
             velocity = stay_above(velocity, height, reference.table.normal)
+            velocity = slide_along(velocity, height, reference.table.normal, self.low)
         self.palm = self.palm + period * drift
         lead = LEAD * (1 + self.waiting / 0.25) if self.waits else self.strongest  # grows while others are awaited
-        self.target = next_target(reference, self.target, velocity - drift, observation, lead, period)
+        fastest = 0.8 if bool(self.low.any()) else math.inf  # [rad/s]: faster joints lag, and tips leave the table
+        self.target = next_target(reference, self.target, velocity - drift, observation, lead, period, fastest)
         return reference.expand(self.target)
 
     def _follow(self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]) -> tuple[Tensor, Tensor]:
@@ -142,6 +147,24 @@ class UncertaintyClosing:
         self.waiting = self.waiting + period if bool(touched.any()) else 0.0
         touching = observation.tactile.contact | (touched & ~self.alive)
         self.settled.update(observation, touching, share, period, pressing=not self.waits)
+
+
+def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:
+    """Return a mask of the contacts that fingertips at the table touch with inclined normals, on the rim above them."""
+    if reference.table is None:
+        return torch.zeros_like(reference.alive)
+    least, near, normals, radius = 0.25, 0.004, reference.normals, reference.hand.tips.radius  # slope, and [m]
+    height = reference.table.height(reference.gains.target + radius[:, None] * normals) - radius
+    return (normals @ reference.table.normal > least) & (height < near)
+
+
+def slide_along(
+    velocity: Float[Tensor, "f 3"], height: Float[Tensor, "f"], up: Float[Tensor, "3"], low: Bool[Tensor, "f"]
+) -> Float[Tensor, "f 3"]:
+    """Return fingertip velocities [m/s]; `low` tips at `height` [m] over the table go down, and then keep low."""
+    rate, gap = 12.0, 0.0003  # [1/s], [m]: the lower a tip, the flatter its contact's normal
+    down = rate * (gap - height) - velocity @ up
+    return velocity + (down * low)[:, None] * up
 
 
 def with_equal_gains(reference: ClosingReference) -> ClosingReference:
