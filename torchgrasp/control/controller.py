@@ -224,8 +224,9 @@ class GraspController:
         self.check(observation, self.pressed)
         if self.check.judged and not self.check.secure:
             assert isinstance(self.closing, UncertaintyClosing)
-            reach, palms = 0.0 if self.length else self.options.palm_reach, (self.closing.palm, self.closing.begun)
-            self.reopening = Reopening(self.reference, self.check.displacement, observation.joints, *palms, reach)
+            reach, palm = 0.0 if self.length else self.options.palm_reach, self.closing.palm
+            begun = palm if bool(observation.tactile.contact.any()) else self.closing.begun
+            self.reopening = Reopening(self.reference, self.check.displacement, observation.joints, palm, begun, reach)
             self.hold, self.check, self.pressed = None, None, 0.0
 
     def _reopen(self, reopening: Reopening, period: float) -> Targets:

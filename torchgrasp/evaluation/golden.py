@@ -4,7 +4,6 @@
 object. Two heavy objects weigh a little less and more than the 0.65 kg that the fingers can carry by friction.
 """
 
-import dataclasses
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -58,7 +57,7 @@ def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
         grasp = load_shipped_grasp(case.object, case.hand)
         error = torch.eye(4, dtype=torch.float64)
         error[:3, 3] = -case.shift * hand.approach
-        once = TrialSpec(options=ClosingOptions(attempts=1))  # a hand that misses the object ends soon
-        spec = dataclasses.replace(once, simulator=simulator, mass=case.mass, hold_time=0.5)
+        once = ClosingOptions(attempts=1)  # a hand that misses the object ends soon
+        spec = TrialSpec(simulator=simulator, mass=case.mass, hold_time=0.5, options=once)
         found = close_hand(grasp, hand, thing.mesh, spec, error=error, parts=thing.parts)
         yield GoldenResult(case, found.held, found.seconds)
