@@ -135,7 +135,7 @@ class GripHold:
         self.aim = self.friction.mean
         self.sent, self.trim, self.most = *np.zeros((2, len(push), 3)), 0.0
         self.time = self.steady = self.over = 0.0
-        self.released = False
+        self.released = self.strained = False  # whether the load is steady, and forces are near their limits
         self.status, self.slid = Status.OK, np.zeros(len(push))
 
     @property
@@ -226,7 +226,8 @@ class GripHold:
         self.cover = min(max(self.cover + fastest * (2 if share < 0.95 else -4), 0.0), 1.0)
         goal = self.friction.high if share > 1.0 and self.cover == 0.0 else self.friction.mean
         self.aim += min(max(goal - self.aim, -fastest), fastest)
-        beyond = share > 0.95 and self.cover == 0.0 and bool(self.sliding.any())
+        self.strained = share > 0.95
+        beyond = self.strained and self.cover == 0.0 and bool(self.sliding.any())
         self.over = self.over + period if beyond and self.weight > LIFTED else 0.0
         if self.over > 0.25:  # [s]
             self.status = Status.TOO_HEAVY

@@ -245,8 +245,10 @@ class TrialRun:
         return (hold.friction.mean, hold.weight) if isinstance(hold, GripHold) else (math.nan, math.nan)
 
     def strained(self) -> bool:
-        """Return whether any joint's drive would need its greatest torque or more to reach its target."""
-        reference = self.robot.reference
+        """Return whether any joint's drive would need its greatest torque or more to reach its target, or to grip."""
+        reference, hold = self.robot.reference, self.controller.hold
+        if isinstance(hold, GripHold):
+            return hold.strained
         effort = torch.tensor([reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names])
         return bool((reference.kp * (self.controller.targets.joints - self.observation.joints).abs() >= effort).any())
 
