@@ -28,9 +28,6 @@ HOUSEHOLD = PROTOCOLS["household"]
 LEAST_HELD = 0.85
 """Share of the best grasps that must hold with everything unknown together: the project's own bar."""
 
-GRIPS = {"barrett": 8.0}
-"""Grip [N] of hands that press harder than `HOUSEHOLD` asks, chosen on eight other families."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Lift:
@@ -91,15 +88,15 @@ def _row(what: str, lifts: Sequence[Lift], base: Sequence[Lift], judged: bool) -
 
 def lift_object(spec: TableSpec, subject: Subject, hand: str, names: Sequence[str]) -> list[list[dict[str, Any]]]:
     """Return the lifts of an object under each perturbation, kept or run."""
-    force, found = GRIPS.get(hand, HOUSEHOLD.trial.force), []
+    found = []
     for name in names:
-        what = f"{hand}_{subject.label}", name, force, spec.grasps, spec.draws
+        what = f"{hand}_{subject.label}", name, HOUSEHOLD.trial.pressing, spec.grasps, spec.draws
         path = spec.kept("household", *what).with_suffix(".json")
-        found.append(keep(path, lambda: list(map(dataclasses.asdict, _lift(spec, subject, hand, name, force)))))  # noqa: B023
+        found.append(keep(path, lambda: list(map(dataclasses.asdict, _lift(spec, subject, hand, name)))))  # noqa: B023
     return found
 
 
-def _lift(spec: TableSpec, subject: Subject, hand: str, name: str, force: float) -> Iterator[Lift]:
+def _lift(spec: TableSpec, subject: Subject, hand: str, name: str) -> Iterator[Lift]:
     """Lift the best grasps of one view under one perturbation."""
     perturbation, (mesh, parts, mass, view) = PERTURBATIONS[name], read_solid(subject)
     began = time.process_time()
@@ -112,7 +109,7 @@ def _lift(spec: TableSpec, subject: Subject, hand: str, name: str, force: float)
         for draw in range(spec.draws):
             began = time.process_time()
             seed = seed_of(spec.seed, subject.label, view, rank, draw)
-            trial = perturb_trial(dataclasses.replace(HOUSEHOLD.trial, force=force), perturbation, mass, seed)
+            trial = perturb_trial(HOUSEHOLD.trial, perturbation, mass, seed)
             error = draw_error(dataclasses.replace(HOUSEHOLD, noise=perturbation.pose), grasp, mesh, seed)
             felt = fit_view(spec, subject, seen)[1]
             done = close_hand(grasp, load_hand(hand), mesh, trial, seed, error=error, parts=parts, surface=felt)
