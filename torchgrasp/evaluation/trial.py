@@ -168,10 +168,8 @@ class TrialRun:
     def __init__(self, driver: TrialDriver) -> None:
         spec, trial = driver.spec, driver.trial
         self.spec, self.mass, self.obj_from_world = spec, driver.scene_spec.mass, driver.obj_from_world
-        slide = trial.truth.slide
-        self.slide = (
-            None if slide is None else (driver.obj_from_world[:3, :3].T @ slide.to("cpu", torch.float64)).numpy()
-        )
+        slide, world_from_obj = trial.truth.slide, driver.obj_from_world[:3, :3].T
+        self.slide = None if slide is None else (world_from_obj @ slide.to("cpu", torch.float64)).numpy()
         guarded = spec.approach if spec.components.stops and can_guard(driver.reference) else 0.0
         self.controller = GraspController(driver.reference, spec.closing, spec.pressing, spec.options, guarded)
         scene_spec = driver.scene_spec if trial.truth.camera is None else self._relook(driver, trial.truth.camera)
