@@ -201,7 +201,8 @@ class TrialSpec(Value):
         control_rate: rate of the controller [Hz].
         simulator: "sapien" or "mujoco".
         density: density of the object [kg/m^3]; it replaces `mass` unless None.
-        patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x force x patch.
+        patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x force x patch. With 0
+            the contacts are hard points, as in the paper.
         kp: stiffness of all joint drives [N m/rad]; by default the hand's own.
         overlap: largest overlap [m] of hand and object at the start; the object's convex parts bulge a little.
         table: whether the object stands on a table.
@@ -230,7 +231,7 @@ class TrialSpec(Value):
     control_rate: Annotated[float, Range(10.0, 1000.0)] = 100.0
     simulator: Simulator = "sapien"
     density: Annotated[float, Range(1.0, 100000.0)] | None = None
-    patch: Annotated[float, Range(0.0, 1.0)] = 0.005
+    patch: Annotated[float, Range(0.0, 1.0)] = 0.0
     kp: Annotated[float, Range(0.001, 1000000.0)] | None = None
     overlap: Annotated[float, Range(0.0, 1.0)] = 1e-3
     table: bool = True

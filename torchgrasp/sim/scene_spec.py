@@ -104,7 +104,7 @@ class SceneSpec:
     travel: float = 0.1
     approach: tuple[float, float, float] = (0.0, 0.0, 0.0)
     table: bool = True
-    patch: float = 0.005
+    patch: float = 0.0
     height: float | None = None
     neighbours: tuple[Body, ...] = ()
     self_pairs: tuple[tuple[str, str], ...] = ()

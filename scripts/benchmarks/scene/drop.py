@@ -57,7 +57,7 @@ class SettlingTable:
 
     def __init__(self, damping: float = 2.0, timestep: float = 1 / 240) -> None:
         self._sapien, self._physx = import_sapien()
-        self._system, self._scene = open_world(self._sapien, self._physx, 9.81, timestep)
+        self._system, self._scene = open_world(self._sapien, self._physx, 9.81, timestep, patches=True)
         self._material = self._physx.PhysxMaterial(0.8, 0.8, 0.0)
         place(self._sapien, self._scene, "table", table(self._sapien, self._physx, self._material))
         self._damping, self._timestep = damping, timestep
