@@ -7,8 +7,8 @@ Settings that differ from SAPIEN's defaults:
 * Sleeping is off, because a sleeping body keeps stale contacts.
 * The object's inertia is set with its mass.
 * Penetrations are resolved at 1 m/s at most.
-* The solver is PGS: with TGS a held object creeps, far inside the friction cones. Only TGS knows contact patches; it then
-  iterates 32 times a step, because with 10 the object creeps faster.
+* The solver is PGS: with TGS a held object creeps, far inside the friction cones. Only TGS knows contact patches; with
+  32 iterations a step the object creeps slower than with 10.
 * Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its own.
 """
 
