@@ -131,6 +131,6 @@ def test_simulators_let_no_bar_creep_in_the_hand(simulator):
     bar = trimesh.creation.box((0.0151, 0.1569, 0.012))
     bar.apply_transform(trimesh.transformations.rotation_matrix(-math.asin(0.111), [0, 0, 1], [0, 0, 0]))
     bar.apply_translation([0, 0, 0.006])
-    spec = TrialSpec("uncertainty", "grip", mass=0.249, table_friction=0.2, simulator=simulator)
-    result = close_hand(grasp, hand, bar, spec)
-    assert result.held and math.degrees(result.slip.angle) < 6
+    spec = TrialSpec(mass=0.249, table_friction=0.2, simulator=simulator, push=(0.0, 0.0, -1.5))
+    result = close_hand(grasp, hand, bar, spec)  # MuJoCo: 0.9 mm and 3.5 degrees; PhysX's TGS lets the bar fall
+    assert result.held and result.slip.distance < 0.0013 and math.degrees(result.slip.angle) < 5
