@@ -1,7 +1,7 @@
 """The golden set: shipped grasps with known verdicts, to check that an installed simulator works.
 
 `scripts/train.py golden` makes the grasps. In two cases the hand is displaced by 60 mm, so that the fingers miss the
-object. Two heavy objects weigh a little less and more than the 0.65 kg that the fingers can carry by friction.
+object. Two heavy objects weigh a little less and more than the 0.65 kg that fingers can carry by friction with 4 N.
 """
 
 from collections.abc import Iterator
@@ -58,6 +58,6 @@ def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
         error = torch.eye(4, dtype=torch.float64)
         error[:3, 3] = -case.shift * hand.approach
         once = ClosingOptions(attempts=1)  # a hand that misses the object ends soon
-        spec = TrialSpec(simulator=simulator, mass=case.mass, hold_time=0.5, options=once)
+        spec = TrialSpec(force=4.0, simulator=simulator, mass=case.mass, hold_time=0.5, options=once)
         found = close_hand(grasp, hand, thing.mesh, spec, error=error, parts=thing.parts)
         yield GoldenResult(case, found.held, found.seconds)
