@@ -209,8 +209,7 @@ def test_a_start_in_the_object_missing_contact_and_too_little_friction_are_named
     missed = lift_grasp(GraspTrial(hand, grasp, Truth(cylinder((0.4, 0.0)))), spec)
     assert (missed.status, missed.contact_order) == (Status.NO_CONTACT, ())
     slippery = close("allegro", spec=dataclasses.replace(spec, friction=0.02))
-    lost = Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED, Status.TOO_HEAVY
-    assert slippery.status in lost and not slippery.held
+    assert slippery.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED) and not slippery.held
 
 
 @pytest.mark.parametrize(("friction", "simulator"), [(0.4, "sapien"), (0.8, "sapien"), (0.4, "mujoco")])

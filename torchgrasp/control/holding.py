@@ -177,8 +177,9 @@ class GripHold:
         self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
         self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
         points = observation.tips.numpy() - self.radius[:, None] * self.normals
-        contacts, forces = balance(points, observation.tactile.contact.numpy()), observation.tactile.forces.numpy()
-        if friction_ratios(contacts.inner(self.solver.start), self.normals).max() > self.aim:
+        touching, forces = observation.tactile.contact.numpy(), observation.tactile.forces.numpy()
+        contacts = balance(points, touching)
+        if not touching.all() and friction_ratios(contacts.inner(self.solver.start), self.normals).max() > self.aim:
             contacts = balance(points)  # the fingers that touch cannot hold without the others
         self.felt = self.felt + low_pass(8.0, period) * (forces - self.felt)
         load = self._weight(contacts.wrench @ forces.ravel())

@@ -106,7 +106,7 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
 
 
 def run_lift(driver: TrialDriver, low: float = 0.0) -> ClosureResult:
-    """Run a lift trial in a fresh scene; the hand rises slowly to the height `low` [m], and then fast."""
+    """Run a lift trial in a fresh scene; the hand rises slowly to the height `low` [m] at most, and then fast."""
     started = time.perf_counter()
     lift = _Lift(driver.open(), low)
     status = lift.perform()
@@ -122,7 +122,8 @@ class _Lift:
 
     def __init__(self, run: TrialRun, low: float = 0.0) -> None:
         self.run, self.spec = run, run.spec
-        self.low, self.slow = low, 1.0 if low else 0.0  # height [m] and time [s] of a first rise
+        self.low = min(low, run.spec.lift_height)  # height [m] of a slow first rise
+        self.slow = 1.0 if low else 0.0  # its time [s]
         self.ticks: list[Tick] = []
         self.arrived, self.pushed, self.strained, self.unbalanced = 0, 0.0, False, math.nan
         self.touched: int | None = None

@@ -125,9 +125,8 @@ def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry,
         truth = _left_behind(trial, result, _felt(controller), grasps.obj_from_hand[row].to("cpu", torch.float64))
         trial = dataclasses.replace(trial, grasp=grasps[row], truth=truth, seed=seed_of(trial.seed, "again"))
         tried, driver = [*tried, row], TrialDriver(trial, driver.spec)
-    return *done, LiftTry(
-        tried[-1], run_lift(driver, LiftCheck.low if tries > 1 else 0.0)
-    )  # the last try lifts whatever it feels
+    last = run_lift(driver, LiftCheck.low if tries > 1 else 0.0)  # it goes on whatever the hand feels
+    return *done, LiftTry(tried[-1], last)
 
 
 class _CheckedLift(_Lift):

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 ARMATURE = 1e-3  # inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it
 
-
 LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
 """Names of the mount's prismatic joints along the world's z axis, and along the approach; at 0 the approach ends."""
 
