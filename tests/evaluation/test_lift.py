@@ -70,17 +70,20 @@ def test_an_object_where_it_was_seen_is_held_at_once(seen):
     assert (result.attempts, result.stops, result.held) == (1, 0, True)
 
 
-@pytest.mark.parametrize(("aside", "simulator"), [(0.028, "sapien"), (-0.026, "mujoco"), (-0.026, "sapien")])
+@pytest.mark.parametrize(("aside", "simulator"), [(0.026, "sapien"), (-0.026, "sapien"), (0.022, "mujoco")])
 def test_a_hand_that_closed_beside_the_object_closes_once_more(seen, aside, simulator):
-    """The object stands off along its own tangents at the contacts: no plane there tells it, its round surface does."""
+    """The object stands off along its own tangents at the contacts: no plane there tells it, its round surface does.
+
+    Whether the hand that closes once still lifts the object hangs on rounding; that the object slips, does not.
+    """
     pytest.importorskip(simulator)
     spec = dataclasses.replace(STILL, simulator=simulator)
     once, again = (
         close("allegro", cylinder((aside, 0.0)), dataclasses.replace(spec, options=options), surface=seen)
         for options in (ClosingOptions(attempts=1), None)
     )
-    assert (once.attempts, once.held) == (1, False)
-    assert again.attempts > 1 and again.held
+    assert once.attempts == 1 and once.slip.distance > 0.002
+    assert again.attempts > 1 and again.held and again.slip.distance < 0.001
 
 
 @pytest.mark.parametrize("aside", [(0.0, 0.03), (0.0, -0.04)])
