@@ -23,7 +23,7 @@ NORMAL_NOISE, RIM_NORMAL_NOISE, HIDDEN_NORMAL_NOISE = 0.05, 0.5, 0.25
 RIM_NOISE = 0.002  # standard deviation [m] of a point of the outline
 FREE_NOISE = 0.003  # standard deviation [m] of a distance observed in free space: it is only a lower bound
 OUTLINE_ERROR = 0.005  # the object may reach this far [m] beyond its outline: a camera loses rims
-MAX_RADIUS = 1.15  # radius, normalised, within which free space is probed: inside the sphere of the points outside
+MAX_RADIUS = 1.15  # share of the radius of all points within which free space is probed
 STD_FACTORS: dict[tuple[Kind, bool], float] = {
     ("ball", True): 0.5, ("revolution", True): 0.56, ("mirrored", True): 0.59, ("vessel", True): 0.58,
     ("ball", False): 0.56, ("revolution", False): 0.59, ("mirrored", False): 0.75,
@@ -82,8 +82,11 @@ def camera_support(seen: PreparedCloud, completion: Completion | None, noise: fl
     center, kind, parts, free, inside = frame.center, "whole", (), None, True
     if completion is not None:
         parts, kind = _observe_completion(completion, frame), completion.kind
-        free = free_space(completion.outline, frame, table)
-        inside = float(completion.outline.violation(center.cpu())) == 0.0  # not so for an arch or a bowl
+        reach = float(torch.linalg.vector_norm(frame.normalise(surface), dim=-1).max())
+        free = free_space(completion.outline, frame, table, reach)
+        # Not so for an arch or a bowl, nor for a ring whose front hides its middle: there the outline is close.
+        beside, away = completion.outline.hull_distance(center.cpu()), torch.cdist(center[None], surface).amin()
+        inside = float(completion.outline.violation(center.cpu())) == 0.0 and float(beside) < -0.5 * float(away)
     sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
     x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
     distance = torch.cdist(x, frame.normalise(surface)).amin(1)
@@ -185,13 +188,13 @@ def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
     return observe(frame, wall.points, wall.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE), errors / frame.scale
 
 
-def free_space(outline: Outlines, frame: Normalisation, table: float | None = None) -> FreeSpace:
-    """Return points in free space, and lower bounds of their signed distance.
+def free_space(outline: Outlines, frame: Normalisation, table: float | None = None, reach: float = 1.0) -> FreeSpace:
+    """Return points in free space, and lower bounds of their signed distance, out to the normalised radius `reach`.
 
     The points lie beside the object's outline, and below the table. A bound becomes an observation only where the shape
     violates it: otherwise the shape would inflate to its visual hull.
     """
-    origin, scale = frame.center.double().cpu(), frame.scale
+    origin, scale = frame.center.double().cpu(), frame.scale * reach
     points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
     least = outline.hull_distance(points) - OUTLINE_ERROR
     if table is not None:
@@ -203,7 +206,7 @@ def free_space(outline: Outlines, frame: Normalisation, table: float | None = No
             least = torch.cat([least, torch.full_like(ground[:, 0], below)])
     x = (points - origin) / scale
     keep = (torch.linalg.vector_norm(x, dim=-1) < MAX_RADIUS) & (least > 0.001)  # a smaller distance is no constraint
-    return x[keep].to(frame.center), least[keep].to(frame.center) / scale
+    return reach * x[keep].to(frame.center), least[keep].to(frame.center) / frame.scale
 
 
 def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[Tensor, "n"]) -> Tensor:

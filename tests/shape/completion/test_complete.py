@@ -2,12 +2,15 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from tests.make import near, real
 from torchgrasp import PointCloud, fit_shape
+from torchgrasp.cloud import look_at, partial_view
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.shape.completion.complete import (
     LEAST_NOISE,
@@ -20,6 +23,7 @@ from torchgrasp.shape.completion.complete import (
 )
 from torchgrasp.shape.completion.silhouette import _project, silhouette
 from torchgrasp.shape.completion.symmetry import SymmetryScorer, planes_near, reflect
+from torchgrasp.shape.surface import extract_surface
 
 CAMERA = real([0.45, 0.0, 0.3])
 
@@ -228,3 +232,23 @@ def test_a_box_that_shows_one_face_does_not_know_its_depth(depth: float):
     found = shape.predict(back)
     assert (found.distance.abs() <= 2 * shape.std_factor * found.variance.sqrt()).double().mean() > 0.9
     assert found.std_m.median() > 0.01
+
+
+@pytest.mark.filterwarnings("ignore::torchgrasp.errors.Gap")
+@pytest.mark.parametrize("azimuth", [15.0, 70.0])
+def test_a_frame_of_thin_bars_is_as_deep_as_the_bars_are_wide_and_its_rings_are_open(azimuth: float):
+    upright, rings = trimesh.transformations.rotation_matrix(math.pi / 2, [0, 1, 0]), []
+    for side in (-0.028, 0.028):
+        ring = trimesh.creation.torus(0.022, 0.0025, 48, 16).apply_transform(upright)
+        rings.append(ring.apply_translation([0.0, side, 0.0245]))
+        ends = [[0.0, 1.8 * side, 0.0245], [-0.09, 1.8 * side, 0.0245]]
+        rings.append(trimesh.creation.cylinder(0.0025, segment=ends, sections=16))
+    frame, volume = trimesh.util.concatenate(rings), sum(float(part.volume) for part in rings)
+    view = partial_view(frame, look_at(azimuth, 40.0, target=frame), seed=0)
+    shape = fit_shape(view, table=0.0)
+    assert extract_surface(shape).mesh().volume < 3.5 * volume
+    points, faces = trimesh.sample.sample_surface(frame, 500, seed=0)
+    truth, normals = torch.from_numpy(np.asarray(points)), torch.from_numpy(frame.face_normals[faces])
+    far = shape.predict(truth[((view.viewpoint - truth) * normals).sum(-1) < 0])
+    error = (far.distance * shape.scale).abs()
+    assert error.median() < 0.0012 and (error < 2 * far.std_m).double().mean() > 0.9

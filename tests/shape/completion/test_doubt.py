@@ -18,6 +18,7 @@ from torchgrasp import cloud_from_depth, fit_shape
 from torchgrasp.cloud import look_at, partial_view
 from torchgrasp.cloud.diagnose import diagnose_cloud
 from torchgrasp.errors import CutOff, FewPoints, Flat, Gap, TwoBodies
+from torchgrasp.shape.completion.silhouette import silhouettes
 
 PATH = {"PYTHONPATH": str(Path(__file__).parents[3])}
 
@@ -102,6 +103,15 @@ def test_a_hole_that_is_seen_through_is_no_surface_and_two_bodies_are_told():
     both = trimesh.util.concatenate([BOX, other])
     with pytest.warns(TwoBodies, match="two bodies that stand apart"):
         fit_shape(partial_view(both, look_at(30.0, 40.0, target=both), n=1000), table=0.0)
+
+
+def test_a_gap_that_is_far_wider_than_the_bars_around_it_is_a_hole_and_a_gap_in_a_face_is_none():
+    ring = on_table(trimesh.creation.torus(0.04, 0.004))
+    hole = silhouettes(partial_view(ring, look_at(30.0, 60.0, target=ring), n=1000))
+    assert 0.020 < float(hole.hull_distance(real([0.0, 0.0, 0.004]))) < 0.036 and hole.gap > 0.04
+    view, face = partial_view(BOX, look_at(30.0, 25.0, target=BOX), n=1000), real([0.04, 0.0, 0.06])
+    patch = silhouettes(view.select(torch.linalg.vector_norm(view.points - face, dim=1) > 0.02))
+    assert float(patch.hull_distance(face)) < -0.02 and patch.gap > 0.025
 
 
 @pytest.mark.parametrize("noise", [False, True])

@@ -1,4 +1,4 @@
-"""Completion of the hidden side by mirror images of the visible side."""
+"""Completion of the hidden side by mirror images of the visible side, and of thin bars by their width."""
 
 import dataclasses
 import math
@@ -12,13 +12,15 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, Value, join
 from torchgrasp.checks import Count, Pose, checked
+from torchgrasp.cloud.neighbours import nearest
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions
+from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions, unit
 from torchgrasp.shape.completion.axis import Revolution, find_axis, find_revolution
 from torchgrasp.shape.completion.ellipsoid import find_ellipsoid
 from torchgrasp.shape.completion.silhouette import FRONT_MARGIN, TIE, Outlines
 from torchgrasp.shape.completion.symmetry import (
+    PROBES,
     Mirror,
     SymmetryScorer,
     find_plane_through_axis,
@@ -32,6 +34,7 @@ NEW, SPACING = 0.006, 0.004  # least distance [m] of a hidden point from the clo
 LEAST_NOISE = 0.003  # standard deviation [m] of a mirrored point of an object that is symmetric about that very plane
 SYMMETRIC, ASYMMETRY = 0.45, 0.060  # score of a symmetric object, and asymmetry [m] for each 1 of score below
 PART = 0.02  # length scale [m] of the asymmetry: a part without a mirror image is missing as a whole
+THIN = 0.012  # width [m] below which a part is a bar: that of a fingertip
 TEMPERATURE = 0.1  # a plane's probability is proportional to exp(score / temperature)
 NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045  # planes near a plane: steps of an axis, angle [rad], shift / size
 
@@ -114,14 +117,15 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     planes, scores = torch.cat([part.planes for part in parts]), torch.cat([part.scores for part in parts])
     images = sorted(_mirror(parts), key=lambda image: -image.score)
 
-    def allowed(image: _Image) -> Bool[Tensor, "n"]:
-        hidden = _hidden(scorer, image.points)
+    def allowed(image: _Image, apart: float = NEW) -> Bool[Tensor, "n"]:
+        hidden = _hidden(scorer, image.points, apart)
         if scorer.table is None:
             return hidden
         # Free space already bounds the shape at the face on the table.
         return hidden & ~((scorer.table.height(image.points) < 0.004) & (image.normals @ scorer.table.normal < -0.7))
 
     merged = merge_hidden(_Image.of(scorer, none, none, len(planes)), images, allowed, _thin)
+    merged = merge_hidden(merged, [_back_of_bars(scorer, len(planes))], lambda image: allowed(image, 0.0), _thin)
     chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
     shared, asymmetry = chosen.shared.flatten(1), chosen.variance.sqrt()
     kind: Kind = "guess" if not len(planes) else "mirrored" if round_body is None else "revolution"
@@ -204,6 +208,26 @@ def _mirror_in(scorer: SymmetryScorer, number: int, plane: Mirror, score: float)
     return mirror
 
 
+def _back_of_bars(scorer: SymmetryScorer, n_planes: int) -> _Image:
+    """Return points on the far side of parts narrower than `THIN`: a thin bar is about as deep as it is wide.
+
+    The points lie behind the middle of a bar, across its direction. Their standard deviation is half of the width.
+    """
+    points, near = scorer.points, nearest(scorer.points, 30)[1]  # the neighbours with which normals are fitted
+    half = -scorer.outline.hull_distance(points)
+    width = 2 * half[near].amax(1)
+    rows = torch.nonzero((2 * half > 0.8 * width) & (width < THIN))[:, 0]
+    rows = rows[farthest_points(points[rows], 2 * PROBES, tie=TIE)]
+    around, width = points[near[rows]], width[rows]
+    bar = torch.linalg.svd(around - around.mean(1, keepdim=True), full_matrices=False).Vh[:, 0]
+    rays = points[rows, None] - torch.stack([view.viewpoint for view in scorer.outline.views])
+    facing = (rays * scorer.normals[rows, None]).sum(-1).argmin(1)
+    ray = unit(rays[torch.arange(len(rows), device="cpu"), facing])
+    back = unit(ray - (ray * bar).sum(1, keepdim=True) * bar)
+    image = _Image.of(scorer, points[rows] + width[:, None] * back, back, n_planes)
+    return dataclasses.replace(image, variance=(0.5 * width) ** 2)
+
+
 def merge_hidden(
     merged: SomeHidden,
     parts: Iterable[SomeHidden],
@@ -225,9 +249,9 @@ def merge_hidden(
     return merged
 
 
-def _hidden(scorer: SymmetryScorer, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return which points are away from the cloud, hidden in every view, and not below the table."""
-    hidden = (scorer.nearest(points)[0] > NEW) & scorer.outline.hides(points)
+def _hidden(scorer: SymmetryScorer, points: Float[Tensor, "n 3"], apart: float = NEW) -> Bool[Tensor, "n"]:
+    """Tell which points are hidden in every view, not below the table, and farther than `apart` [m] from the cloud."""
+    hidden = (scorer.nearest(points)[0] > apart) & scorer.outline.hides(points)
     return hidden if scorer.table is None else hidden & (scorer.table.height(points) > -FRONT_MARGIN)
 
 

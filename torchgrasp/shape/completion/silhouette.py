@@ -127,7 +127,8 @@ def silhouettes(cloud: PointCloud) -> Outlines:
 def silhouette(view: PointCloud) -> Silhouette:
     """Return the silhouette of one view, whose points must all lie in front of the camera.
 
-    A gap within the outline does not count as free space, because a mirror-like patch is not measured either.
+    A gap within the outline is a hole if it is far wider than the surface around it, as in a frame of bars. Other gaps
+    do not count as free space, because a mirror-like patch is not measured either.
     """
     from scipy.ndimage import binary_fill_holes, distance_transform_edt
     from scipy.spatial import KDTree
@@ -151,6 +152,7 @@ def silhouette(view: PointCloud) -> Silhouette:
     grown = np.asarray(binary_fill_holes(measured))
     gaps = grown & ~measured
     gap = 2 * (float(_distance(gaps).max()) * cell + GROW * spacing) * bool(gaps.any())
+    grown &= ~_find_holes(gaps, measured, GROW * spacing / cell)
     inside = _distance(grown) * cell > SHRINK * spacing
     unseen = _beyond_image(view.frustum, axes, corner, cell, grown, GROW * spacing)
     inside |= unseen
@@ -163,6 +165,22 @@ def silhouette(view: PointCloud) -> Silhouette:
     origin, axes = view.viewpoint.double().cpu(), torch.from_numpy(axes)
     edge = torch.from_numpy(rim) @ axes + origin, torch.from_numpy(rim_normals) @ axes
     return Silhouette(origin, axes, torch.from_numpy(corner), cell, *images, *edge, bool(unseen.any()), gap)
+
+
+def _find_holes(gaps: np.ndarray, measured: np.ndarray, grown: float) -> np.ndarray:
+    """Return the cells of gaps that are over twice as wide as all surface around them.
+
+    The surface is the mask `measured`, which was grown by so many cells.
+    """
+    from scipy.ndimage import label, maximum
+
+    number, count = label(gaps)  # pyright: ignore[reportGeneralTypeIssues]
+    wide, holes = _distance(measured), np.zeros_like(gaps)
+    for k, radius in enumerate(maximum(_distance(gaps), number, range(1, count + 1)) + grown, start=1):
+        if radius > 2 * grown:  # a narrower gap lies between sparse points
+            around = measured & (_distance(number != k) < 2 * radius)
+            holes |= (number == k) & (2 * (wide[around].max() - grown) < radius)
+    return holes
 
 
 def _beyond_image(
