@@ -1,10 +1,12 @@
 """Closing once more: what is judged before a lift, how the hand opens, and when the controller does so."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
 
+from tests.make import load_hand
 from tests.point_fingers import (
     NORMALS,
     PERIOD,
@@ -16,11 +18,14 @@ from tests.point_fingers import (
     real,
     reference,
 )
-from torchgrasp import GraspController
+from torchgrasp import ContactSpec, GraspController
 from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
+from torchgrasp.control import ClosingReference
 from torchgrasp.control.controller import CLOSING_TIME
 from torchgrasp.control.recovery import MISPLACED, OPENING_TIME, PRESSING_TIME, GraspCheck, Reopening
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
+from torchgrasp.data.shipped import load_shipped_grasp
+from torchgrasp.errors import BadArgument
 
 STILL, PLACE = torch.zeros(3).double(), torch.zeros(6).double()
 
@@ -43,12 +48,26 @@ def test_grasp_check_accepts_balanced_contacts_and_rejects_a_finger_in_the_air()
         assert check.judged and check.secure is (missing is None)
 
 
-@pytest.mark.parametrize(("degrees", "secure"), [(25.0, True), (36.0, False)])
-def test_grasp_check_rejects_forces_beyond_friction(degrees, secure):
-    # all normals lean the same way across the line of the forces, by more or less than atan(0.6) = 31 degrees
+@pytest.mark.parametrize(("degrees", "friction"), [(25.0, 0.6), (36.0, 0.6), (36.0, 0.8), (25.0, 0.4)])
+def test_grasp_check_rejects_forces_beyond_the_planned_friction(degrees, friction):
+    """All normals lean the same way across the line of the forces, by more or less than the angle of friction."""
     angle = torch.deg2rad(real(degrees))
     leaning = torch.stack([NORMALS[:, 0] * angle.cos(), angle.sin().expand(3), NORMALS[:, 2]], -1)
-    assert judge(pressing(normals=leaning)).secure is secure
+    check = judge(pressing(normals=leaning), reference=on_table(friction=friction))
+    assert check.secure is (math.tan(math.radians(degrees)) < friction)
+
+
+def test_the_closing_plan_knows_the_friction_that_the_grasp_was_planned_for():
+    hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+
+    def planned(friction):
+        meta = {name: text for name, text in (grasp.meta | {"friction": friction}).items() if text is not None}
+        return ClosingReference.from_grasp(hand, dataclasses.replace(grasp, meta=meta)).friction
+
+    assert list(map(planned, ("0.5", "1", None))) == [0.5, 1.0, ContactSpec().friction]
+    for text in ("wet", "-1", "nan"):
+        with pytest.raises(BadArgument, match=r"friction.*a positive number"):
+            planned(text)
 
 
 @pytest.mark.parametrize(("off", "secure"), [(0.9 * MISPLACED, True), (1.1 * MISPLACED, False)])

@@ -172,7 +172,7 @@ class GraspCheck:
             self.judged, self.secure = True, self._is_secure()
 
     def _is_secure(self) -> bool:
-        """Return whether all fingers touch, friction lets forces balance, and the palm has followed the object."""
+        """Return whether all fingers touch, planned friction lets forces balance, and the palm has followed."""
         touches = self.touches
         if not bool((touches.contact | ~touches.known).all()):
             return False
@@ -181,8 +181,8 @@ class GraspCheck:
         if not bool(touches.felt.all()):
             return True  # without all places of contacts the forces cannot be judged
         points, normals = touches.means()
-        ratio, friction = tangential_ratio(least_friction_forces(points, normals), normals), 0.6  # of many objects
-        return bool((ratio <= friction).all())  # false for NaN, where no forces balance
+        ratio = tangential_ratio(least_friction_forces(points, normals), normals)
+        return bool((ratio <= self.reference.friction).all())  # false for NaN, where no forces balance
 
 
 class Reopening:

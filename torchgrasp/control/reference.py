@@ -20,6 +20,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
+from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ class ClosingReference(Value):
         max_force: largest normal force [N] of a fingertip; None means no limit.
         distance_variance: variance [m^2] of the signed distance at each contact (f_cov in Eq. 12 of the paper); None
             if it is unknown. The closing "paper" needs it.
+        friction: coefficient of friction that the grasp was planned for.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -70,6 +72,7 @@ class ClosingReference(Value):
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
     distance_variance: Float[Tensor, "f"] | None = None
+    friction: Annotated[float, Range(0.0, 10.0)] = ContactSpec.friction
 
     @classmethod
     @checked
@@ -129,7 +132,9 @@ class ClosingReference(Value):
         pose, opened, joints = grasp.obj_from_hand[0], grasp.pregrasp[0], grasp.joints[0]
         stiffness, approach = forces.drive_stiffness(hand, kp), _approach_in_hand(grasp)
         plan = cls(hand, stiffness, pose, opened, joints, squeeze[0], normals[0], gains, approach)
-        return dataclasses.replace(plan, distance_variance=_distance_variance(grasp))
+        friction = _number(grasp, "friction")
+        told = {} if friction is None else {"friction": friction}
+        return dataclasses.replace(plan, distance_variance=_distance_variance(grasp), **told)
 
     def as_printed(self) -> "ClosingReference":
         """Return the plan with Sigma_cov and K_P of Eqs. (26) and (27) as the paper prints them, for closing "paper".
@@ -206,13 +211,23 @@ def next_target(
 
 def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
     """Return f_cov [m^2] of one grasp's contacts; `std_m`^2 without a normalised variance, None without its unit."""
-    contacts, unit_m = grasp.contacts, grasp.meta.get("unit_m")
+    contacts, unit_m = grasp.contacts, _number(grasp, "unit_m")
     if contacts.variance is None:
         return contacts.require_std()[0] ** 2
+    return None if unit_m is None else contacts.variance[0] * unit_m**2
+
+
+def _number(grasp: Grasps, name: str) -> float | None:
+    """Return a positive number from the metadata of a grasp, or None if they lack it."""
+    if (text := grasp.meta.get(name)) is None:
+        return None
     try:
-        return None if unit_m is None else contacts.variance[0] * float(unit_m) ** 2
+        number = float(text)
     except ValueError:
-        raise BadArgument("grasp.meta['unit_m']", repr(unit_m), "a number of metres") from None
+        number = math.nan
+    if not number > 0.0:
+        raise BadArgument(f"grasp.meta[{name!r}]", repr(text), "a positive number")
+    return number
 
 
 def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:

@@ -111,7 +111,7 @@ def test_the_papers_law_needs_the_variance_of_the_signed_distance():
     GraspController(plan)
     with pytest.raises(BadArgument, match=r"closing: expected .*unit_m.*got 'paper' without f_cov"):
         GraspController(plan, "paper")
-    with pytest.raises(BadArgument, match=r"unit_m.*metres.*got 'wide'"):
+    with pytest.raises(BadArgument, match=r"unit_m.*a positive number.*got 'wide'"):
         ClosingReference.from_grasp(hand, dataclasses.replace(grasp, meta=unknown | {"unit_m": "wide"}))
     contacts = dataclasses.replace(grasp.contacts, variance=None)  # of another planner
     found = ClosingReference.from_grasp(hand, dataclasses.replace(grasp, contacts=contacts, meta=foreign))
