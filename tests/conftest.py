@@ -4,7 +4,9 @@ import dataclasses
 import functools
 import inspect
 import math
+import os
 import re
+import sys
 import typing
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +23,36 @@ from torch import Tensor
 if TYPE_CHECKING:
     from torchgrasp.values import PointCloud
 
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of many processes would compile the library and the tests anew
+sys.dont_write_bytecode = False
+
 by_jaxtyping = jaxtyping.jaxtyped
+EACH = 20
+"""Of the calls of a function in a test the first so many are checked, and then one of so many, as checks take time."""
+
+
+class Tests:
+    """A plugin that counts the tests, among them examples of docstrings."""
+
+    count = 0
+
+    def pytest_runtest_setup(self) -> None:
+        self.count += 1
+
+
+tests = Tests()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(tests)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give each process a run of neighbouring tests, which share fixtures, until one has none left."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log) if config.getoption("dist") == "load" else None
 
 
 def jaxtyped(thing: Any = None, **options: Any) -> Any:
@@ -39,8 +70,14 @@ def jaxtyped(thing: Any = None, **options: Any) -> Any:
     checked = beartype(conf=BeartypeConf(violation_type=TypeError))(thing)
     thing.__annotations__ = written
 
+    test, number = 0, 0
+
     @functools.wraps(thing)
     def call(*args: Any, **kwargs: Any) -> Any:
+        nonlocal test, number
+        test, number = tests.count, 1 + number if test == tests.count else 1
+        if number > EACH and number % EACH:
+            return thing(*args, **kwargs)
         push_shape_memo({})
         try:
             return checked(*args, **kwargs)

@@ -18,8 +18,10 @@ from tests.hostile.arguments import checked_things, required, wrong_arguments
 from tests.hostile.samples import hints_of
 from tests.hostile.unchanged import changes
 from tests.make import run_python
+from tests.pinch import QUICK
 from torchgrasp.base import Value
 from torchgrasp.checks import Count
+from torchgrasp.specs import TrialSpec
 
 IMPORTED = "sympy", "sapien"
 """Packages of others that are imported late, and leave a filter of warnings and variables of the environment."""
@@ -34,7 +36,10 @@ def sweep(folder: Path) -> None:
     for name, (make, annotated) in sorted(checked_things().items()):
         call, hints = make(), hints_of(annotated)
         good = required(annotated, call, folder)
-        one = {key: 1 for key, hint in hints.items() if hint == Count}  # one start, one row: little work
+        one: dict[str, Any] = {
+            key: 1 for key, hint in hints.items() if hint == Count
+        }  # one start, one row: little work
+        one |= {key: QUICK for key, hint in hints.items() if hint == TrialSpec | None}
         wrong = list(wrong_arguments(annotated, call))  # beartype draws which items it looks at
         value = getattr(call, "__self__", None)
         kept = [value if isinstance(value, Value) else None, good, [x for _, x in wrong]]
