@@ -29,7 +29,7 @@ from torchgrasp.errors import BadArgument
 
 # isort: off
 from torchgrasp.marks import (  # noqa: F401
-    ANY, DTYPES, FINITE, LEAST, MOST, NUMBERS, RIGID, Count, Fraction, Length, Measured, Pose, Poses, Positive,
+    ANY, DTYPES, FINITE, LEAST, MOST, NUMBERS, RIGID, Count, Force, Fraction, Length, Measured, Pose, Poses, Positive,
     Range, Rows, Seed, check_dense, check_moved, check_path, describe, fits, is_known, is_rigid, is_tensor, is_tracked,
     show,
 )  # fmt: skip

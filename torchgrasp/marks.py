@@ -44,6 +44,7 @@ Fraction = Annotated[float, Range(0.0, 1.0)]  # a share or a probability
 Measured = Annotated[float, ANY]  # a number that is NaN if nothing was measured
 Pose = Annotated[Float[Tensor, "4 4"], RIGID]  # a rigid transform
 Poses = Annotated[Float[Tensor, "g 4 4"], RIGID]  # a rigid transform for each row
+Force = Annotated[float, Range(0.01, 100.0)]  # a normal force [N] of a finger
 Length = Annotated[float, Range(0.0, 10.0)]  # a length [m] within reach
 DTYPES = {"Float": (torch.float32, torch.float64), "Int": (torch.int64, torch.int32), "Bool": (torch.bool,)}
 """The dtypes that each kind of annotation allows."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from torchgrasp.base import FINGERTIPS, Value
-from torchgrasp.checks import Length, Range, checked
+from torchgrasp.checks import Force, Length, Range, checked
 from torchgrasp.closure import ClosingOptions, SensorModel, choose_options
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, as_plane
@@ -225,7 +225,7 @@ class TrialSpec(Value):
     lift_height: Annotated[float, Range(0.0, 1.0)] = 0.1
     hold_time: Annotated[float, Range(0.0, 60.0)] = 2.0
     shake: Annotated[float, Range(0.0, 0.02)] = 0.0
-    force: Annotated[float, Range(0.01, 100.0)] | None = None
+    force: Force | None = None
     noise: bool = True
     timestep: Annotated[float, Range(0.0001, 1 / 60)] = 1 / 500
     control_rate: Annotated[float, Range(10.0, 1000.0)] = 100.0

@@ -3,24 +3,36 @@
 import dataclasses
 import importlib
 import json
+import math
 import os
 import pkgutil
 import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
+from torchgrasp.evaluation.intervals import Share, contrast_over
 from torchgrasp.files import write_file
 from torchgrasp.geometry.linalg import unit
 
 ROOT = Path(__file__).resolve().parents[2]
 Result = TypeVar("Result")
+
+
+def mean_over(values: Iterable[tuple[str, float]]) -> Share:
+    """Return the mean, with its 95 % interval, of values given as pairs of unit name and value; NaN is left out."""
+    sums: dict[str, tuple[float, int]] = {}
+    for name, value in values:
+        if not math.isnan(value):
+            before = sums.get(name, (0.0, 0))
+            sums[name] = before[0] + value, before[1] + 1
+    return contrast_over([sums], [1.0])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from paper.trials import most_certain_first
 from torchgrasp import (
     ClosingReference,
     Contacts,
@@ -36,7 +37,6 @@ from torchgrasp.data.shipped import GRASPED, load_shipped_grasp
 from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.protocols import draw_error, seed_of
-from torchgrasp.evaluation.score import most_certain_first
 from torchgrasp.files import format_json, write_file
 from torchgrasp.posture_model.mixture import PAPER_ENERGY, encode, load_mixture, mixture_path
 from torchgrasp.shape.conditioning import longest_distance

@@ -6,7 +6,7 @@ from typing import Any
 from paper.rows import Cell, Plan, Row, TableSpec
 from paper.tables6_7 import Asked, count_held, format_points, gather, median, write
 from paper.trials import run_cells
-from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.files import format_columns
 
 PAPER_CHAIN, SUPPORT = Plan("paper", "paper", margins=False), Plan("paper", margins=False)
@@ -60,7 +60,7 @@ def judge(spec: TableSpec, rows: Sequence[Sequence[Cell]]) -> dict[str, dict[str
             "graspable": share_over(count_by((cell.family, bool(cell.lifts)) for cell in row)),
             "held_of_all": share_over(held),
             "held_of_lifted": share_over(count_held(row)),
-            "worth": None if above is None else difference_over(held, above),
+            "worth": None if above is None else contrast_over([held, above], [1.0, -1.0]),
             "plan_cpu_s": median(cell.seconds for cell in row),
         }
         above = held

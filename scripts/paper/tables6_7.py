@@ -13,7 +13,7 @@ import tyro
 from paper.rows import Cell, Plan, Row, TableSpec
 from paper.trials import PAPER, run_cells
 from torchgrasp.evaluation import Share
-from torchgrasp.evaluation.intervals import contrast_over, count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.files import format_columns, format_json, write_file
 from torchgrasp.specs import ClosingMode, HoldingMode
 
@@ -97,7 +97,7 @@ def judge_table7(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
     own = [f"{closing}, {holding}" for closing, holding in OWN.items()]
     pairs = [(names[0], name) for names in (alike, own) for name in names[1:]]
     pairs += [(names[2], name) for names in (alike, own) for name in names[3:]]  # the paper's law over the baselines
-    gains = {f"{a} over {b}": difference_over(held[a], held[b]) for a, b in pairs}
+    gains = {f"{a} over {b}": contrast_over([held[a], held[b]], [1.0, -1.0]) for a, b in pairs}
     for name, gain in gains.items():
         print(f"{name}: {format_points(gain)}")
     write(spec.out / "table7.json", spec, rows, {"rows": numbers, "gains": gains})

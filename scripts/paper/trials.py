@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
+from torchgrasp.control.reference import check_single
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation import PROTOCOLS, close_hand
 from torchgrasp.evaluation.protocols import draw_error, seed_of
-from torchgrasp.evaluation.score import most_certain_first
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -195,6 +195,13 @@ class _Bench:
         found = close_hand(grasp, self.hand, mesh, trial, touch, parts=parts, error=error)
         certain = most_certain_first(found.contact_order, grasp) if found.contact_order else None
         return Lift(view, rank, draw, found.status, found.pushed.distance, found.slip.distance, certain)
+
+
+def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
+    """Return whether the finger with the most certain contact touched first, as the paper expects (Sec. 5, Eq. 27)."""
+    check_single(grasp)
+    std_m = grasp.contacts.require_std()[0]
+    return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())
 
 
 def in_order(grasps: Grasps, first: Order) -> Grasps:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from benchmarks.common import mean_over
 from benchmarks.ground_truth import read_views, sample_mesh
 
 from torchgrasp.data import read_entry
-from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.files import format_columns
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.support import STD_FACTORS

@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from benchmarks.common import mean_over
 from scipy import stats
 
-from torchgrasp.evaluation.intervals import contrast_over, difference_over, mean_over, share_over
+from torchgrasp.evaluation.intervals import contrast_over, share_over
 
 COUNTS = {"tin": (9, 10), "cup": (3, 12), "jug": (7, 7), "box": (1, 6), "egg": (5, 9), "rod": (20, 30), "can": (4, 4)}
 OTHERS = {"tin": (4, 10), "cup": (3, 11), "jug": (6, 7), "box": (3, 6), "egg": (0, 9), "rod": (10, 30), "can": (4, 4)}
@@ -34,7 +35,7 @@ def test_a_share_has_the_interval_of_scipy_s_bootstrap_of_a_ratio_of_sums() -> N
 
 def test_paired_differences_and_contrasts_have_the_quantiles_of_every_resample() -> None:
     some, other = ({name: column[name] for name in list(COUNTS)[:5]} for column in (COUNTS, OTHERS))
-    found = difference_over(some, other)
+    found = contrast_over([some, other], [1.0, -1.0])
     assert found.value == pytest.approx(25 / 44 - 16 / 43)
     assert [found.low, found.high] == pytest.approx(exact([some, other], [1, -1]), abs=0.02)
     third = contrast_over([some, other, some], [0.5, -2.0, 0.25])
@@ -42,13 +43,15 @@ def test_paired_differences_and_contrasts_have_the_quantiles_of_every_resample()
 
 
 def test_equal_columns_differ_by_nothing_one_unit_has_no_interval_and_means_of_zeros_and_ones_are_shares() -> None:
-    assert difference_over(COUNTS, COUNTS)[:3] == (0.0, 0.0, 0.0)
+    assert contrast_over([COUNTS, COUNTS], [1.0, -1.0])[:3] == (0.0, 0.0, 0.0)
     assert share_over(dict(reversed(COUNTS.items()))) == share_over(COUNTS)
     assert share_over(COUNTS | {"none": (0, 0)}) == share_over(COUNTS)
     one = share_over({"tin": (3, 4)})
     assert one.value == 0.75 and math.isnan(one.low) and math.isnan(one.high) and one.units == 1
     assert all(math.isnan(x) for x in share_over({})[:3])
-    lacking = difference_over(COUNTS, {"tin": (1, 2)})  # resamples without the tin say nothing of the second
+    lacking = contrast_over(
+        [COUNTS, {"tin": (1, 2)}], [1.0, -1.0]
+    )  # resamples without the tin say nothing of the second
     assert lacking.low < lacking.value < lacking.high
     values = [(name, float(k < passed)) for name, (passed, total) in COUNTS.items() for k in range(total)]
     assert mean_over(values) == contrast_over([COUNTS], [1.0])

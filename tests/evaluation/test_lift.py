@@ -15,7 +15,6 @@ from torchgrasp.control import observe
 from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.evaluation import GraspTrial, Truth, close_hand
 from torchgrasp.evaluation.lift import LIFT_TIME, _Lift, lift_grasp
-from torchgrasp.evaluation.score import most_certain_first
 from torchgrasp.evaluation.trial import TrialDriver, derive_reference
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.signed_distance import field_from_surface
@@ -251,17 +250,6 @@ def test_a_mesh_and_a_table_that_contradict_the_grasp_are_told_before_any_work(m
     for shift in (0.0, 0.02):  # the estimated surface may be off
         with pytest.raises(InterruptedError):
             close_hand(grasp, hand, cylinder((0.0, shift)), table=Plane.horizontal(0.005))
-
-
-def test_the_most_certain_finger_is_told():
-    _, grasp = pinch("allegro")
-    uneven = torch.tensor([[0.004, 0.002, 0.003]]).double()
-    grasp = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, std_m=uneven))
-    assert most_certain_first((1, 0, 2), grasp)
-    assert not most_certain_first((0, 1, 2), grasp)
-    assert not most_certain_first((), grasp)
-    with pytest.raises(BadArgument, match="exactly one"):
-        most_certain_first((0,), grasp[:0])
 
 
 def test_bad_arguments_are_refused():

@@ -8,12 +8,12 @@ import pytest
 import torch
 from paper.ladder import RUNGS, count_all, judge
 from paper.rows import Cell, Lift, Plan, Row, TableSpec
-from paper.trials import in_order, run_cells
+from paper.trials import in_order, most_certain_first, run_cells
 from paper.whole import PARTS, Sizes, Whole, reproduce
 
 from tests.pinch import pinch
 from torchgrasp.base import join
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 
 TINY = Sizes(starts=8, drawn=8, postures=200, fitted=100, apart=50, folds=2, families=0, grasps=2, draws=1)
 
@@ -85,3 +85,14 @@ def test_an_object_without_a_grasp_fails_every_lift(tmp_path):
     found = judge(TableSpec(tmp_path, grasps=1, draws=2), [below, [cell(name, 2, 2, "better") for name in "xyz"]])
     assert found["row"]["held_of_all"].value == 0.5 and found["row"]["held_of_lifted"].value == 0.75
     assert found["better"]["worth"][:2] == (0.5, 0.0)
+
+
+def test_the_most_certain_finger_is_told():
+    _, grasp = pinch("allegro")
+    uneven = torch.tensor([[0.004, 0.002, 0.003]]).double()
+    grasp = dataclasses.replace(grasp, contacts=dataclasses.replace(grasp.contacts, std_m=uneven))
+    assert most_certain_first((1, 0, 2), grasp)
+    assert not most_certain_first((0, 1, 2), grasp)
+    assert not most_certain_first((), grasp)
+    with pytest.raises(BadArgument, match="exactly one"):
+        most_certain_first((0,), grasp[:0])

@@ -13,7 +13,7 @@ from torchgrasp.cloud.parts import LAYER, find_second_body
 from torchgrasp.cloud.prepare import FACING, share_facing
 from torchgrasp.cloud.viewpoint import MAX_BEHIND, MAX_EDGE_ON, share_unseen
 from torchgrasp.errors import BadArgument, NoSupport
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import LEAST_WIDTH, find_supports
 from torchgrasp.values import PointCloud
@@ -39,7 +39,7 @@ class Advice(Value):
 
 
 def judge_view(
-    cloud: PointCloud, clean: PointCloud, up: Float[Tensor, "3"], table: Plane | None, stands: bool = True
+    cloud: PointCloud, clean: PointCloud, up: Vector, table: Plane | None, stands: bool = True
 ) -> list[Advice]:
     """Return advice on a cloud's camera, vertical and table, and on other bodies left in; refusals come first.
 
@@ -71,7 +71,10 @@ def judge_view(
             found = f"a vertical {_triple(up)} that {down:.0%} of the visible normals contradict: they point down"
             advice.append(Advice(found, "the vertical of the cloud's frame: --up X Y Z", False))
     if support is not None:
-        advice.append(_describe_support(*support, up))
+        normal = support[0].normal
+        found = f"a plane under the object, a table left in, with {support[1]:.0%} of the points"
+        turn = f" --up {_triple(normal, ' ')}, its normal," if float(normal @ up) < 0.97 else ""
+        advice.append(Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True))
     body = find_second_body(points, up, float(nearest(points, 2)[0][:, -1].median()))
     if body is not None:
         found = f"two bodies that stand apart, the second of {float(body.double().mean()):.0%} of the points"
@@ -81,9 +84,7 @@ def judge_view(
     return sorted(advice, key=lambda a: not a.refused)
 
 
-def _find_support(
-    points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None, up: Float[Tensor, "3"]
-) -> tuple[Plane, float] | None:
+def _find_support(points: Points, eye: Vector | None, up: Vector) -> tuple[Plane, float] | None:
     """Return the plane of a table that was left in the cloud, and its share of the points; None if there is none."""
     for sky, width in ((up, 0.06), *([(None, LEAST_WIDTH)] if eye is not None else [])):
         try:
@@ -126,10 +127,10 @@ def _judge_camera(clean: PointCloud, given: bool) -> list[Advice]:
 
 
 def _judge_height(
-    points: Float[Tensor, "n 3"],
+    points: Points,
     eye: Float[Tensor, "*views 3"],
     given: bool,
-    up: Float[Tensor, "3"],
+    up: Vector,
     table: Plane | None,
     support: tuple[Plane, float] | None,
 ) -> list[Advice]:
@@ -158,14 +159,7 @@ def _judge_height(
     return [Advice(f"a camera {place}", fix, True)]
 
 
-def _describe_support(plane: Plane, share: float, up: Float[Tensor, "3"]) -> Advice:
-    """Return the advice to cut off a table, given the table's plane and its share of the cloud's points."""
-    turn = f" --up {_triple(plane.normal, ' ')}, its normal," if float(plane.normal @ up) < 0.97 else ""
-    found = f"a plane under the object, a table left in, with {share:.0%} of the points"
-    return Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True)
-
-
-def judge_pixels(cloud: PointCloud, viewpoint: Float[Tensor, "3"]) -> list[Advice]:
+def judge_pixels(cloud: PointCloud, viewpoint: Vector) -> list[Advice]:
     """Return advice if many outliers are flying pixels: they lie before or behind other points on camera rays."""
     points = cloud.points.double()
     inlier = find_inliers(points)

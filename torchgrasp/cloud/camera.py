@@ -20,6 +20,9 @@ from torchgrasp.values import PointCloud
 if TYPE_CHECKING:
     import trimesh
 
+Image = Float[Tensor, "h w"]
+Transform = Float[Tensor, "4 4"]
+
 WIDTH, HEIGHT, FOCAL = 640, 480, 616.0  # columns, rows and focal length [px] of the default camera
 INTRINSICS = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64)
 """Intrinsics [px] of the default camera."""
@@ -31,7 +34,7 @@ def look_at(
     elevation: Annotated[float, Range(-89.9, 89.9)],
     distance: Annotated[float, Range(0.01, 10.0)] = 0.5,
     target: "Float[Tensor, '3'] | trimesh.Trimesh | None" = None,
-) -> Float[Tensor, "4 4"]:
+) -> Transform:
     """Return the pose obj_from_camera (4 x 4) of an upright camera that looks at a target.
 
     Args:
@@ -64,7 +67,7 @@ def look_at(
 @checked
 def partial_view(
     mesh: "trimesh.Trimesh",
-    camera_pose: Float[Tensor, "4 4"],
+    camera_pose: Transform,
     n: Annotated[int, Range(4, 1000000)] = 1000,
     noise: bool | SensorName | SensorNoise = True,
     seed: Seed = 0,
@@ -101,9 +104,7 @@ def partial_view(
     return cloud.select(rows)
 
 
-def cast_mesh(
-    mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"]
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Image, Image]:
     """Return a mesh's depth image [m], and |cosine| between ray and face normal; both are 0 where a ray misses."""
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
@@ -126,9 +127,7 @@ def cast_mesh(
     return images[0], images[1]
 
 
-def _in_image_box(
-    mesh: "trimesh.Trimesh", obj_from_camera: Float[Tensor, "4 4"], x: Float[Tensor, "h w"], y: Float[Tensor, "h w"]
-) -> Bool[Tensor, "h w"]:
+def _in_image_box(mesh: "trimesh.Trimesh", obj_from_camera: Transform, x: Image, y: Image) -> Bool[Tensor, "h w"]:
     """Return a mask of the camera rays (x, y, 1) that pass through the bounding box of the mesh in the image."""
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
@@ -140,12 +139,12 @@ def _in_image_box(
 
 def render_depth(
     meshes: "Sequence[trimesh.Trimesh]",
-    camera_pose: Float[Tensor, "4 4"],
+    camera_pose: Transform,
     *,
     table: float | None = 0.0,
     noise: bool | SensorName | SensorNoise = True,
     seed: int = 0,
-) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
+) -> tuple[Image, Int[Tensor, "h w"]]:
     """Return a depth image [m] of meshes on a table, as the default camera measures it, and true pixel labels.
 
     Depth is 0 where nothing was measured. Label 0 is the table or nothing, label k is mesh k - 1. The table is a disc
@@ -165,9 +164,7 @@ def render_depth(
     return depth, labels
 
 
-def _cast_table(
-    height: float, obj_from_camera: Float[Tensor, "4 4"]
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+def _cast_table(height: float, obj_from_camera: Transform) -> tuple[Image, Image]:
     """Return the table's depth image [m], and |cosine| between ray and normal; both are 0 where a ray misses."""
     row, column = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
     rays = torch.stack([column, row, torch.ones_like(row)], -1) @ torch.linalg.inv(INTRINSICS).T

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, unit
 
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
@@ -18,7 +18,7 @@ def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
 
 
 def nearest(
-    points: Float[Tensor, "n 3"], k: int, rows: Int[Tensor, "m"] | None = None
+    points: Points, k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
     """Return distances and indices of the k nearest points to each point in `rows`, by default to every point.
 
@@ -32,13 +32,13 @@ def nearest(
     return torch.from_numpy(distance).to(points), torch.from_numpy(np.asarray(index, dtype=np.int64)).to(points.device)
 
 
-def find_inliers(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
+def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
     """Return a mask of the given points (by default all points) that are not outliers; see `remove_outliers`."""
     spacing = nearest(points, 9, rows)[0][:, 1:].mean(-1)  # to eight: more than fly off a rim together
     return spacing <= 2.5 * spacing.median()  # the spacing of real views varies less, with depth and slope
 
 
-def is_flat(points: Float[Tensor, "n 3"]) -> bool:
+def is_flat(points: Points) -> bool:
     """Return whether a cloud is no thicker than its noise: twice the error of quadrics around the points."""
     points = points[draw_rows(len(points), 2000).to(points.device)].double()
     points = points[find_inliers(points)]
@@ -46,16 +46,14 @@ def is_flat(points: Float[Tensor, "n 3"]) -> bool:
     return float(thickness) < max(2 * float(fit_quadrics(points)[2].median()), 1e-3 * float(length))
 
 
-def fit_planes(
-    points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"] | None = None
-) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
+def fit_planes(points: Points, rows: Int[Tensor, "m"] | None = None) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
     """Fit a plane around each point in `rows`, by default each point; return normals of any sign and rms errors [m]."""
     distance, index = nearest(points, 25, rows)  # about eight for each of a plane's three unknowns
     mean_squares, axes = _principal_axes(points[index], _weigh(distance))
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
 
-def fit_quadrics(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+def fit_quadrics(points: Points) -> tuple[Points, Points, Float[Tensor, "n"]]:
     """Fit a quadric around each point; return the point moved onto it, the unit normal there, and the rms error [m].
 
     Planes would move the points of a ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
@@ -94,7 +92,7 @@ def _weigh(distance: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:
 
 def _principal_axes(
     near: Float[Tensor, "n k 3"], weight: Float[Tensor, "n k"]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+) -> tuple[Points, Float[Tensor, "n 3 3"]]:
     """Return the weighted variances of neighbours along their principal axes, ascending, and the axes as columns."""
     difference = near - (weight[..., None] * near).sum(1)[:, None]
     return torch.linalg.eigh((weight[..., None] * difference).transpose(-1, -2) @ difference)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.checks import RIGID, check_tensor, is_rigid
 from torchgrasp.cloud.tables import parse_npy, read_lines, read_suffixed
 from torchgrasp.errors import BadArgument, NoSupport
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support, find_table
 
@@ -77,7 +77,7 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
 
 
 def find_plausible(
-    points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], table: Plane | float | None, up: object, known_unit: bool
+    points: Points, pose: Float[Tensor, "4 4"], table: Plane | float | None, up: object, known_unit: bool
 ) -> tuple[Support, ...]:
     """Return the planes on which objects may stand; refuse a pose or a depth unit that contradicts the view."""
     eye = pose[:3, 3]
@@ -99,7 +99,7 @@ def find_plausible(
     return supports
 
 
-def check_view(points: Float[Tensor, "n 3"], pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
+def check_view(points: Points, pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
     """Raise `BadArgument` if a table in the view contradicts the camera's pose or the unit of the depth."""
     with contextlib.suppress(NoSupport):
         _check_supports(find_table(points, pose[:3, 3], None, None), pose, up, known_unit)
@@ -151,7 +151,7 @@ def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up
     raise BadArgument("camera_pose", f"a table whose normal ({normal}) is {angle:.0f} degrees from up", allowed)
 
 
-def _check_given_table(points: Float[Tensor, "n 3"], plane: Plane) -> None:
+def _check_given_table(points: Points, plane: Plane) -> None:
     """Refuse a given table that the camera did not see: it is above most points, or far below all points."""
     height = plane.height(points[:: 1 + len(points) // 20_000].double())
     low, middle = float(torch.quantile(height, 0.01)), float(height.median())
@@ -160,9 +160,7 @@ def _check_given_table(points: Float[Tensor, "n 3"], plane: Plane) -> None:
         raise BadArgument("table", found, "the table in the frame of a camera_pose in metres, whose z looks forward")
 
 
-def check_sizes(
-    points: Float[Tensor, "n 3"], labels: Tensor, pose: Float[Tensor, "4 4"], plane: Plane
-) -> tuple[str, ...]:
+def check_sizes(points: Points, labels: Tensor, pose: Float[Tensor, "4 4"], plane: Plane) -> tuple[str, ...]:
     """Refuse a depth unit that makes objects too large or small for a hand; return a note if the camera is high."""
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     sizes = sorted(float((part.amax(0) - part.amin(0)).max()) for part in parts if len(part) >= 100)

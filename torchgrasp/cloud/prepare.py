@@ -15,7 +15,7 @@ from torchgrasp.cloud.pose import check_rigid
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.errors import BadArgument, TooFewPoints
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import unit, unit_of_any
+from torchgrasp.geometry.linalg import Points, Vector, unit, unit_of_any
 from torchgrasp.values import PointCloud
 
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
@@ -38,8 +38,8 @@ class PreparedCloud(Value):
     """A checked cloud, and the points and normals to which a shape is fitted."""
 
     cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
-    points: Float[Tensor, "n 3"]  # at most 2000 of them, in float64
-    normals: Float[Tensor, "n 3"]  # at `points`, of unit length
+    points: Points  # at most 2000 of them, in float64
+    normals: Points  # at `points`, of unit length
     viewpoint: Float[Tensor, "*views 3"] | None  # the camera [m] of all `points`, or of each, if known
     frustum: Float[Tensor, "*views 4 3"] | None  # normals of the sides of the camera's view, if known
 
@@ -51,7 +51,7 @@ class PreparedCloud(Value):
 
 @checked
 def prepare_cloud(
-    cloud: PointCloud, generator: torch.Generator, clean: bool = True, up: Float[Tensor, "3"] | None = None
+    cloud: PointCloud, generator: torch.Generator, clean: bool = True, up: Vector | None = None
 ) -> PreparedCloud:
     """Check a cloud, and return the points and normals to which a shape is fitted: at most 2000, drawn at random.
 
@@ -108,7 +108,7 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
     return _fit_normals(remove_duplicates(cloud), clean=True)
 
 
-def _fit_normals(cloud: PointCloud, clean: bool, up: Float[Tensor, "3"] | None = None) -> PointCloud:
+def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> PointCloud:
     """Return distinct points with fitted outward normals; if `clean`, without outliers and moved onto the fit."""
     if clean:
         cloud = cloud.select(find_inliers(cloud.points.double()))
@@ -130,7 +130,7 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Float[Tensor, "3"] | None =
     return dataclasses.replace(cloud, points=points, normals=normals, viewpoint=viewpoint)
 
 
-def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> NormalCheck:
+def compare_normals(points: Points, normals: Points) -> NormalCheck:
     """Return how well normals agree among neighbouring points: which are flipped, and whether signs can be trusted."""
     distance, index = nearest(points, 9)  # the point itself and eight neighbours: enough for a majority
     directions = unit(normals)
@@ -147,9 +147,7 @@ def compare_normals(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"])
     return NormalCheck(flipped, opposed, oriented=opposed < 0.35, scaled=int(scaled.sum()))
 
 
-def share_facing(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*views 3"]
-) -> float:
+def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*views 3"]) -> float:
     """Return the share of normals that face the camera: nearly 1 in a single view, half on a whole surface."""
     return float((((viewpoint - points) * normals).sum(-1) > 0).double().mean())
 

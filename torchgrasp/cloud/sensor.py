@@ -93,7 +93,13 @@ def add_noise(
 
     measured = depth > 0
     own = patches(1.0, sensor.grain) if sensor.grain else normal()
-    noisy = _random_noise(torch.where(measured, depth, 1.0), own, sensor) + patches(sensor.bias, sensor.bias_width)
+    noisy = torch.where(measured, depth, 1.0)
+    if sensor.base:
+        disparity = sensor.base / noisy + sensor.disparity * own
+        noisy = sensor.base / (torch.round(disparity / sensor.step) * sensor.step).clamp_min(sensor.step)
+    else:
+        noisy = noisy + sensor.sigma(noisy) * own
+    noisy = noisy + patches(sensor.bias, sensor.bias_width)
     # A rim pixel has, within two pixels, background or a surface more than 10 mm away.
     far = torch.from_numpy(maximum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
     near = torch.from_numpy(minimum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
@@ -113,14 +119,6 @@ def add_noise(
         second = column - torch.where(measured, sensor.base / depth, 0.0)  # column in the other eye's image
         lost = lost | (second.flip(1).cummin(1).values.flip(1) < second)
     return torch.where(measured & ~lost, noisy, 0.0)
-
-
-def _random_noise(depth: Tensor, normal: Tensor, sensor: SensorNoise) -> Tensor:
-    """Return depths [m] with a camera's random noise and depth steps, given a standard normal number for each."""
-    if not sensor.base:
-        return depth + sensor.sigma(depth) * normal
-    disparity = sensor.base / depth + sensor.disparity * normal
-    return sensor.base / (torch.round(disparity / sensor.step) * sensor.step).clamp_min(sensor.step)
 
 
 def estimate_noise(

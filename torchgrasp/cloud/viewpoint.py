@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows, nearest
 from torchgrasp.errors import NoSupport
-from torchgrasp.geometry.linalg import fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import Points, Vector, fibonacci_sphere, unit
 from torchgrasp.geometry.support import find_supports
 
 MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
@@ -17,11 +17,11 @@ DRAWN = 2000  # most points that tell where the camera was
 
 
 def guess_viewpoint(
-    points: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    up: Float[Tensor, "3"] | None = None,
+    points: Points,
+    normals: Points,
+    up: Vector | None = None,
     assumed: bool = False,
-) -> tuple[Float[Tensor, "3"], float]:
+) -> tuple[Vector, float]:
     """Return a camera position [m] that explains a view, and the angle [deg] within which the camera is likely.
 
     Of all directions above the support, the one that explains the points best is taken; the camera is placed along it,
@@ -52,7 +52,7 @@ def guess_viewpoint(
     return centre + 4 * radius * directions[best], angle if score[best] > 1 else 180.0
 
 
-def can_see(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> bool:
+def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
     """Return whether a camera at a place [m] can have taken a view.
 
     Seen from there, points must not hide other points. In addition, one of three conditions must hold: the points are
@@ -76,7 +76,7 @@ def can_see(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoi
     return True
 
 
-def _enclose(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+def _enclose(points: Points) -> tuple[Vector, Float[Tensor, ""]]:
     """Return the centre of the points' box along their principal axes, and its distance to the farthest point."""
     axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh  # independent of the frame
     along = points @ axes.T
@@ -85,7 +85,7 @@ def _enclose(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Te
 
 
 def _explain(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoints: Float[Tensor, "k 3"]
+    points: Points, normals: Points, viewpoints: Float[Tensor, "k 3"]
 ) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
     """Return two scores of each camera position, at most 1, for how well it explains a view's bulge and point density.
 
@@ -104,9 +104,7 @@ def _explain(
     return bulging, 1 - error / density.abs().mean().clamp_min(1e-12)
 
 
-def share_unseen(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
-) -> tuple[float, float]:
+def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[float, float]:
     """Return the share of points that a camera would see edge-on, and the share of points hidden behind others.
 
     The second share is 1 if a point lies behind the camera.

@@ -1,13 +1,13 @@
 """Desired forces of the fingers, and the joint targets that exert them with position-controlled drives."""
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import named_tensors, settle
-from torchgrasp.checks import Positive, Range, check_dense, checked
+from torchgrasp.checks import Force, Positive, check_dense, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.hand.hand import Hand
@@ -46,9 +46,7 @@ class Squeeze(NamedTuple):
 
 
 @checked(gradients=True)
-def squeeze(
-    hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
-) -> Squeeze:
+def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> Squeeze:
     """Return joint targets with which position-controlled fingers press at their planned contacts.
 
     The targets solve J^T f = kp (target - q) for the `desired_forces` f. They may exceed a joint's limits. They are

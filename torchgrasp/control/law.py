@@ -9,6 +9,10 @@ from torch import Tensor
 
 from torchgrasp.geometry.linalg import cholesky, limit_norm, squared_mahalanobis
 
+Vectors = Float[Tensor, "*b 3"]
+Numbers = Float[Tensor, "*b"]
+Matrices = Float[Tensor, "*b 3 3"]
+
 POSITION_FLOOR = 0.005
 """Standard deviation [m], in all directions, of errors of hand pose and joint zeros; it keeps Eq. (27) finite."""
 
@@ -23,7 +27,7 @@ MAX_SPEED = 0.04  # largest speed [m/s] of a fingertip
 MAX_STEP = 0.05  # largest change [rad] of a joint in one tick; it bounds steps near a singular posture
 
 
-def surface_covariance(normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3 3"]:
+def surface_covariance(normals: Vectors, std_m: Numbers) -> Matrices:
     """Return the covariance [m^2] of each contact's position in the closing "uncertainty": n n^T s^2 + floor^2 I.
 
     n is the contact's normal, s the shape's deviation `std_m`; the floor is the hand's, equal in all directions.
@@ -31,9 +35,7 @@ def surface_covariance(normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"
     return _normal_covariance(normals, std_m, POSITION_FLOOR)
 
 
-def printed_covariance(
-    normals: Float[Tensor, "*b 3"], distance_variance: Float[Tensor, "*b"]
-) -> Float[Tensor, "*b 3 3"]:
+def printed_covariance(normals: Vectors, distance_variance: Numbers) -> Matrices:
     """Return the covariance [m^2] that Eq. (27) of the paper prints: Sigma_cov = diag(|R f_cov n|).
 
     `distance_variance` [m^2] is f_cov, the variance of the signed distance. `normals` are R n, in the hand's frame. A
@@ -43,9 +45,7 @@ def printed_covariance(
     return torch.diag_embed((distance_variance[..., None] * normals).abs().clamp_min(floor**2))
 
 
-def force_covariance(
-    forces: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], deviation: Float[Tensor, "*b"] | None = None
-) -> Float[Tensor, "*b 3 3"]:
+def force_covariance(forces: Vectors, normals: Vectors, deviation: Numbers | None = None) -> Matrices:
     """Return the covariance [N^2] of each contact force (Sigma_fd, Eq. 28 of the paper).
 
     It is the variance of the normal force along the normal, plus the sensor's variance, equal in all directions.
@@ -55,13 +55,13 @@ def force_covariance(
     return _normal_covariance(normals, std, FORCE_FLOOR)
 
 
-def _normal_covariance(normals: Float[Tensor, "*b 3"], std: Float[Tensor, "*b"], floor: float) -> Tensor:
+def _normal_covariance(normals: Vectors, std: Numbers, floor: float) -> Tensor:
     """Return covariances (3, 3): the variance `std`^2 along the normal, plus `floor`^2 in all directions."""
     along = normals[..., :, None] * normals[..., None, :] * std[..., None, None] ** 2
     return along + floor**2 * torch.eye(3, dtype=normals.dtype, device=normals.device)
 
 
-def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+def blend(error: Vectors, covariance: Matrices) -> Numbers:
     """Return each finger's share of force control, from 0 to 1: lambda = exp(-e^T Sigma_cov^-1 e / 2), Eq. (26).
 
     It is 1 at the contact, and near 0 where the position error [m] exceeds the shape's uncertainty.
@@ -70,12 +70,12 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
     return torch.exp(-0.5 * squared_mahalanobis(error, factor))
 
 
-def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+def position_gain(covariance: Matrices) -> Vectors:
     """Return the position gain [1/s] on each axis: a constant over the axis's variance, Eq. (27) of the paper."""
     return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
 
-def force_gain(covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float) -> Float[Tensor, "*b 3"]:
+def force_gain(covariance: Matrices, alpha_f: Numbers | float) -> Vectors:
     """Return the force gain [m/(s N)] on each axis: alpha_f [m N/s] over the axis's variance, Eq. (28) of the paper."""
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)
     return alpha_f[..., None] / diagonal if isinstance(alpha_f, Tensor) else alpha_f / diagonal
@@ -93,13 +93,13 @@ def damped_inverse(jacobian: Float[Tensor, "*b m h"], damping: float = 1e-5) -> 
 
 
 def tip_velocity(
-    position_error: Float[Tensor, "*b 3"],
-    force_error: Float[Tensor, "*b 3"],
-    blend: Float[Tensor, "*b"],
-    position_gain: Float[Tensor, "*b 3"],
-    force_gain: Float[Tensor, "*b 3"],
+    position_error: Vectors,
+    force_error: Vectors,
+    blend: Numbers,
+    position_gain: Vectors,
+    force_gain: Vectors,
     together: bool = False,
-) -> Float[Tensor, "*b 3"]:
+) -> Vectors:
     """Return the commanded velocity [m/s] of each fingertip, at most `MAX_SPEED`: the bracket in Eq. (25) of the paper.
 
     The share `blend` of the velocity is force control, the rest position control. With `together`, the limit scales
@@ -113,9 +113,7 @@ def tip_velocity(
     return velocity * (MAX_SPEED / fastest.clamp_min(MAX_SPEED))[..., None, None]
 
 
-def stay_above(
-    velocity: Float[Tensor, "*b 3"], height: Float[Tensor, "*b"], up: Float[Tensor, "3"]
-) -> Float[Tensor, "*b 3"]:
+def stay_above(velocity: Vectors, height: Numbers, up: Float[Tensor, "3"]) -> Vectors:
     """Return fingertip velocities [m/s], slowed downwards so that tips at `height` [m] over the table stay above it."""
     lacking = -POSITION_RATE * height.clamp_min(0.0) - velocity @ up
     return velocity + lacking.clamp_min(0.0)[..., None] * up

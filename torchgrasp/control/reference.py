@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.checks import ANY, Pose, Positive, Range, check_tensor, checked
+from torchgrasp.checks import ANY, Force, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closure import ClosingGains, SensorModel
 from torchgrasp.control import forces, law
 from torchgrasp.control.tactile import Observation
@@ -80,7 +80,7 @@ class ClosingReference(Value):
         cls,
         hand: Hand,
         grasp: Grasps,
-        force: Annotated[float, Range(0.01, 100.0)] = 4.0,
+        force: Force = 4.0,
         kp: Positive | None = None,
         stability: "StabilityModel | None" = None,
     ) -> "ClosingReference":
@@ -240,7 +240,7 @@ def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:
 def closing_gains(
     grasp: Grasps,
     hand: Hand,
-    force: Annotated[float, Range(0.01, 100.0)] = 4.0,
+    force: Force = 4.0,
     stability: "StabilityModel | None" = None,
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.

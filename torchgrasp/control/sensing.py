@@ -164,7 +164,9 @@ class FingertipSensor:
             self.switched = torch.where(self.switched, report.reading > TOUCH_ON, report.reading >= 0.45)
             report = feel_flags(report, self.switched)
         if not bool(self.alive.all()):
-            report = map_tensors(self._silence, report, no_contact(fingers=len(self.alive)))
+            nothing, column = no_contact(fingers=len(self.alive)), self.alive[:, None]
+            silence = lambda x, no: torch.where(self.alive if x.ndim == 1 else column, x, no)  # noqa: E731
+            report = map_tensors(silence, report, nothing)
         late = round(self.model.delay / max(period, 1 / SAMPLING_RATE))
         if self.sensed.reading is not before.reading:  # a sample is held until the next one
             self.reports = [*self.reports, report][-late - 1 :]
@@ -177,7 +179,3 @@ class FingertipSensor:
             drawn = torch.randn(len(torques), generator=self.generator, dtype=torques.dtype)
             torques = torques + self.model.noise * TORQUE_NOISE * drawn
         return torques
-
-    def _silence(self, felt: Tensor, nothing: Tensor) -> Tensor:
-        """Return a measured quantity, replaced by `nothing` at fingertips whose sensor is dead."""
-        return torch.where(self.alive if felt.ndim == 1 else self.alive[:, None], felt, nothing)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Measured, Seed, checked
+from torchgrasp.checks import Seed, checked
 
 Counts = Mapping[str, tuple[int | float, int]]
 """Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and number of values."""
@@ -34,16 +34,11 @@ class Share(NamedTuple):
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
     """Return the numbers of passed and of all trials for each unit, given pairs of unit name and outcome."""
-    return {name: (int(passed), total) for name, (passed, total) in _sum_by(outcomes).items()}
-
-
-def _sum_by(values: Iterable[tuple[str, int | float]]) -> dict[str, tuple[int | float, int]]:
-    """Return the sum and the number of values by unit name, given pairs of unit name and value."""
-    sums: dict[str, tuple[int | float, int]] = {}
-    for name, value in values:
-        before = sums.get(name, (0, 0))
-        sums[name] = before[0] + value, before[1] + 1
-    return sums
+    counts: dict[str, tuple[int, int]] = {}
+    for name, passed in outcomes:
+        before = counts.get(name, (0, 0))
+        counts[name] = before[0] + passed, before[1] + 1
+    return counts
 
 
 @checked
@@ -61,26 +56,12 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
 
 @checked
-def mean_over(values: Iterable[tuple[str, Measured]], seed: Seed = 0) -> Share:
-    """Return the mean, with its 95 % interval, of values given as pairs of unit name and value; NaN is left out."""
-    return contrast_over([_sum_by((name, x) for name, x in values if not math.isnan(x))], [1.0], seed)
-
-
-@checked
-def difference_over(first: Counts, second: Counts, seed: Seed = 0) -> Share:
-    """Return the first success rate minus the second, with a 95 % interval; both rates use the same resampled units.
-
-    An interval of zero width means that the units agree, not that the difference is exact.
-    """
-    return contrast_over([first, second], [1.0, -1.0], seed)
-
-
-@checked
 def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
     """Return a weighted sum of success rates, with a 95 % interval; all rates use the same resampled units.
 
     Each of `columns` holds the counts of one rate. `total` counts the trials of the first column. Resamples in which a
-    column has no trial are left out.
+    column has no trial are left out. The weights 1 and -1 give a difference. An interval of zero width means that the
+    units agree, not that the value is exact.
     """
     resamples = 10_000  # number of resamples behind an interval
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})

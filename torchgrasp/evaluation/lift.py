@@ -141,7 +141,8 @@ class _Lift:
             self.arrived = len(self.ticks) - 1
             for _ in run.close():
                 self._record()
-                if self.touched is None and self._all_touched():
+                all_touched = run.controller.hold is not None or bool(np.isfinite(run.robot.first_touch).all())
+                if self.touched is None and all_touched:
                     self.touched = len(self.ticks) - 1
             self.pressed = len(self.ticks) - 1
             self.touched = self.pressed if self.touched is None else self.touched
@@ -213,10 +214,6 @@ class _Lift:
         """Return how far [m] the object's centre of mass is from its place before the hand touched the object."""
         start = self.ticks[0].centre + torch.from_numpy(self.run.slid)
         return float(torch.linalg.vector_norm(self.ticks[-1].centre - start))
-
-    def _all_touched(self) -> bool:
-        """Return whether all fingers have touched the object, or the closing has ended."""
-        return self.run.controller.hold is not None or bool(np.isfinite(self.run.robot.first_touch).all())
 
     def _verdict(self) -> Status:
         """Return the status of a completed trial: `Status.OK` if the object was held, or else the first failure."""

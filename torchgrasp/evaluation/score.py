@@ -13,10 +13,8 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Count, Measured, checked
-from torchgrasp.control.reference import check_single
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
-from torchgrasp.values import Grasps
 
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),
@@ -257,11 +255,3 @@ def _area_under_curve(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"]) 
         return math.nan
     below, upto = torch.searchsorted(bad, good), torch.searchsorted(bad, good, right=True)
     return float((below + upto).double().mean()) / 2 / len(bad)
-
-
-@checked
-def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
-    """Return whether the finger with the most certain contact touched first, as the paper expects (Sec. 5, Eq. 27)."""
-    check_single(grasp)
-    std_m = grasp.contacts.require_std()[0]
-    return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())

@@ -8,14 +8,14 @@ https://github.com/NVlabs/GraspGen (docs/GRASP_DATASET_FORMAT.md).
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Positive, Range, checked
+from torchgrasp.checks import Force, Positive, checked
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import format_json, write_file
@@ -34,7 +34,7 @@ def save_dexgraspbench(
     grasps: Grasps,
     folder: Path | str,
     object_path: str,
-    force: Annotated[float, Range(0.01, 100.0)] = 4.0,
+    force: Force = 4.0,
     kp: Positive = 5.0,
 ) -> list[Path]:
     """Write each grasp as a file `folder/0.npy`, `folder/1.npy` and so on, for DexGraspBench's evaluator.

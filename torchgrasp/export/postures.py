@@ -1,13 +1,12 @@
 """Export of grasps as postures of named joints: plain JSON, and keyframes of a MuJoCo model."""
 
 import xml.etree.ElementTree as ET
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Positive, Range, checked
+from torchgrasp.checks import Force, Positive, checked
 from torchgrasp.control.forces import Squeeze, squeeze
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.errors import Status
@@ -35,9 +34,7 @@ CONVENTIONS = {
 
 
 @checked
-def format_grasps(
-    hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
-) -> str:
+def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
     """Return grasps as JSON, together with `CONVENTIONS`, which explain the numbers.
 
     The hand moves along "approach" to "pose" in its "pregrasp" posture. It closes to "grasp" in the given time, and in
@@ -117,9 +114,7 @@ def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:
 
 
 @checked
-def format_keyframes(
-    hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
-) -> str:
+def format_keyframes(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
     """Return the hand as MJCF with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
 
     The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl` is the targets of

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any
+from typing import Any
 
 import yaml
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Positive, Range, checked
+from torchgrasp.checks import Force, Positive, checked
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.hand.hand import Hand
@@ -36,9 +36,7 @@ _Dumper.add_representer(float, _Dumper.represent_number)
 
 
 @checked
-def format_moveit(
-    hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
-) -> str:
+def format_moveit(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
     """Return grasps as a YAML list of moveit_msgs/Grasp.
 
     `grasp_pose` is the pose of the root link of the hand's URDF in `OBJECT_FRAME`: attach the end-effector there. The
@@ -74,9 +72,7 @@ def format_moveit(
 
 
 @checked
-def format_trajectories(
-    hand: Hand, grasps: Grasps, force: Annotated[float, Range(0.01, 100.0)] = 4.0, kp: Positive | None = None
-) -> str:
+def format_trajectories(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
     """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp: pre-grasp, grasp, squeeze.
 
     The hand must already be at its pose, which `format_moveit` and `format_grasps` give. Arguments and errors are those

@@ -12,6 +12,7 @@ from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.marks import is_known
 
 Points = Float[Tensor, "n 3"]
+Vector = Float[Tensor, "3"]
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # golden section of the full circle [rad]
 
 

@@ -96,19 +96,14 @@ def field_from_surface(
     values = surface.distance(nodes.reshape(-1, 3), far=True).reshape(nodes.shape[:3])
     known = np.zeros(values.shape, dtype=bool)
     for step, inward, outward in ((2, np.inf, BAND), (1, INWARD * spacing, NEAR * spacing)):
-        values, known = _refine(values), _keep(known)
+        before, values = known, _refine(values)
+        known = np.zeros(values.shape, dtype=bool)
+        known[::2, ::2, ::2] = before
         near = np.nonzero((-inward < values) & (values < outward) & ~known)
         values[near] = surface.distance(np.stack([lines[k][::step][near[k]] for k in range(3)], -1))
         known[near] = True
     to = {"device": vertices.device, "dtype": torch.float64}
     return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
-
-
-def _keep(known: np.ndarray) -> np.ndarray:
-    """Return the mask on a grid twice as fine of the nodes that are known from the coarse grid."""
-    fine = np.zeros([2 * count - 1 for count in known.shape], dtype=bool)
-    fine[::2, ::2, ::2] = known
-    return fine
 
 
 def _refine(values: np.ndarray) -> np.ndarray:

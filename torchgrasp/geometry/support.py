@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.checks import check_tensor
 from torchgrasp.errors import BadArgument, NoSupport
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.plane_fit import LEAST_SHARE, MOST_TILT, REACH, ROUGH, PlaneFit, View, assume_noise, fit_planes
 
@@ -40,7 +40,7 @@ class Support:
         parts = [(sides[:, :3] @ part.T + sides[:, 3:]).amax(0) < margin for part in rows]
         return torch.cat(parts).reshape(points.shape[:-1])
 
-    def moved(self, shift: Float[Tensor, "3"]) -> "Support":
+    def moved(self, shift: Vector) -> "Support":
         """Return the support after a translation [m]."""
         plane = Plane(self.plane.normal, self.plane.offset + float(self.plane.normal @ shift))
         sides = self.sides
@@ -49,9 +49,7 @@ class Support:
         return Support(plane, sides, self.width)
 
 
-def find_table(
-    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], table: Plane | float | None, up: object
-) -> tuple[Support, ...]:
+def find_table(points: Points, viewpoint: Vector, table: Plane | float | None, up: object) -> tuple[Support, ...]:
     """Return the support on a given table, or all supports found in the points, best first; the camera is above."""
     plane = as_plane(table)
     direction = None if up is None else torch.as_tensor(up).double().cpu()
@@ -68,9 +66,9 @@ def find_table(
 
 
 def find_supports(
-    points: Float[Tensor, "n 3"],
-    viewpoint: Float[Tensor, "3"] | None = None,
-    up: Float[Tensor, "3"] | None = None,
+    points: Points,
+    viewpoint: Vector | None = None,
+    up: Vector | None = None,
     least_width: float = LEAST_WIDTH,
 ) -> tuple[Support, ...]:
     """Return the planes that support objects in a view, the most plausible first, each with the region that it covers.
@@ -105,9 +103,7 @@ def find_supports(
     return tuple(candidate.support.moved(centre) for candidate in _ordered(found))
 
 
-def bound(
-    plane: Plane, points: Float[Tensor, "n 3"], on: Bool[Tensor, "n"], eye: Float[Tensor, "3"] | None
-) -> Support | None:
+def bound(plane: Plane, points: Points, on: Bool[Tensor, "n"], eye: Vector | None) -> Support | None:
     """Return the support on a plane, with its region, or None if too few points lie on the plane (the mask `on`).
 
     The region is the convex hull of the largest connected group of these points. Another large group joins it if the
@@ -129,7 +125,7 @@ def bound(
     return Support(plane, torch.cat([outward, (region.sides[:, 2] - outward @ middle)[:, None]], -1), region.width)
 
 
-def _axes(normal: Float[Tensor, "3"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 2"]:
+def _axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
     """Return two unit vectors (columns) perpendicular to a normal; they rotate with the points."""
     side = points[0] - points.mean(0)
     x = unit(side - (side @ normal) * normal)
@@ -181,9 +177,7 @@ def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
             yield flat[own == k + 1]
 
 
-def cross(
-    plane: Plane, points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None
-) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Bool[Tensor, "n"]]:
     """Return where the camera rays through points cross a plane [m], and which points lie behind the plane.
 
     Without a camera, the points themselves are returned, and only points at most `REACH` [m] below count.
@@ -202,7 +196,7 @@ class _Candidate:
 
     support: Support
     score: float
-    middle: Float[Tensor, "3"]
+    middle: Vector
 
     def parallel(self, other: "_Candidate") -> bool:
         """Return whether two planes are parallel within ten degrees."""

@@ -112,8 +112,8 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
         BadArgument: grasps that name no hand, another hand, or fingers that the hand does not have.
         HandFileError: see `load_hand`.
 
-    >>> from torchgrasp import load_object, plan_grasps
-    >>> hand_of(plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=20)).name
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> hand_of(load_shipped_grasp("jug", "barrett")).name
     'barrett'
     """
     name, names = grasps.meta.get("hand"), grasps.meta.get("finger_names")

@@ -23,6 +23,9 @@ from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, check
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values import Contacts, IKSeeds
 
+Wanted = Float[Tensor, "r p d"]
+Given = Float[Tensor, "s d"]
+
 LENGTH_SCALE, COSINE_SCALE = 0.01, 0.5  # distances of tip centres [m] and of pad axes that count the same
 CANDIDATES = 64  # nearest postures of a row whose clearances are measured; also the most seeds of a row
 ASSIGNMENTS = 6  # assignments of contacts to fingers in which a row is compared with the whole library
@@ -46,7 +49,7 @@ class PostureLibrary(Value):
     joints: Float[Tensor, "s h"]
     vf_from_hand: Float[Tensor, "s 4 4"]
     centres: Float[Tensor, "s f 3"]
-    feature: Float[Tensor, "s d"]
+    feature: Given
     spheres: Float[Tensor, "s k 3"]
 
     def __post_init__(self) -> None:
@@ -166,7 +169,7 @@ def nearest_postures(
 
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
-) -> tuple[Float[Tensor, "r p 4 4"], Float[Tensor, "r p d"]]:
+) -> tuple[Float[Tensor, "r p 4 4"], Wanted]:
     """Return frame and features of r contact sets for p assignments to fingers, valid where `framed` is true."""
     stand_in = torch.eye(3, dtype=centres.dtype, device=centres.device)
     triangle = torch.where(framed[..., None, None], triangle_of(centres), stand_in)
@@ -175,17 +178,13 @@ def _describe(
     return obj_from_vf, feature(apply(vf_from_obj, centres), rotate(vf_from_obj, inward))
 
 
-def _energies(
-    wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
-) -> Float[Tensor, "r p s"]:
+def _energies(wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]) -> Float[Tensor, "r p s"]:
     """Return half the squared distance between the features of contacts and postures; infinite where not `framed`."""
     energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
     return torch.where(framed[..., None], energy, torch.inf)
 
 
-def _likely_assignments(
-    wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
-) -> Int[Tensor, "r a"]:
+def _likely_assignments(wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]) -> Int[Tensor, "r a"]:
     """Return the indices of the assignments of contacts to fingers with features nearest to one of 500 postures."""
     if wanted.shape[1] <= ASSIGNMENTS:
         return torch.arange(wanted.shape[1], device=wanted.device).expand(len(wanted), -1)

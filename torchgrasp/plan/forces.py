@@ -154,7 +154,8 @@ def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "
     `slack` is added to the friction coefficient that the forces need: a larger one gives forces nearer to the preferred
     ones. A row is NaN where no balanced forces push at every contact within `MAX_FRICTION`.
     """
-    basis = _null_space(points)  # (b, f, 3, k)
+    wrench = grasp_map(points / centre_and_radius(points)[1])
+    basis = torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:].unflatten(1, points.shape[1:])  # (b, f, 3, k)
     push = -(normals[..., None] * basis).sum(2)  # (b, f, k): a = push z
     slide = basis + normals[..., None] * push[:, :, None]
     pushes, slides = push[..., :, None] * push[..., None, :], slide.mT @ slide
@@ -196,12 +197,6 @@ def _pushing_forces(points: Vectors, normals: Vectors) -> Vectors:
     phi, _ = solve_closure_lp(wrench.flatten(1, 2))
     forces = (phi.unflatten(1, wrench.shape[1:3])[..., None] * wrench[..., :3]).sum(2)
     return torch.where((phi.amin(-1) > 0)[:, None, None], forces, torch.nan)
-
-
-def _null_space(points: Vectors) -> Float[Tensor, "b f 3 k"]:
-    """Return an orthonormal basis of the balanced forces; its k = 3 f - 6 vectors are along the last axis."""
-    wrench = grasp_map(points / centre_and_radius(points)[1])
-    return torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:].unflatten(1, points.shape[1:])
 
 
 def _size(push: Push, slide: Slide, z: Float[Tensor, "b l k"]) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:

@@ -117,13 +117,9 @@ def plan_scene(
             plans.append(ThingPlan(label, 0.0, reason="not tried: another object is easy enough"))
             continue
         plans.append(_plan_thing(dataclasses.replace(scene, target=label), plan))
-    return ScenePlan(tuple(sorted(plans, key=_order)))
-
-
-def _order(thing: ThingPlan) -> tuple[bool, bool, float]:
-    """Return a key for sorting: known success (highest first), then unknown success (NaN), then no grasp."""
-    unknown = math.isnan(thing.success)
-    return thing.grasps is None, unknown, 0.0 if unknown else -thing.success
+    # known success (highest first), then unknown success (NaN), then no grasp
+    plans.sort(key=lambda x: (x.grasps is None, math.isnan(x.success), 0.0 if math.isnan(x.success) else -x.success))
+    return ScenePlan(tuple(plans))
 
 
 def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:

@@ -107,14 +107,11 @@ def _gaps(trees: list[Any]) -> np.ndarray:
             points = trees[small].data[rows]
             distance = trees[large].query(points, distance_upper_bound=FAR)[0]
             least = np.partition(distance, TOUCH - 1)[TOUCH - 1]
-            meet = least < REACH and _ends(points[distance < least + 0.01]) > 1
-            gap[a, b] = gap[b, a] = 0.0 if meet else least
+            if least < REACH:  # a handle or a rim meets its body at two ends
+                ends = label_bodies(torch.from_numpy(points[distance < least + 0.01]), gap=0.015)
+                least = 0.0 if int((torch.bincount(ends) >= 6).sum()) > 1 else least
+            gap[a, b] = gap[b, a] = least
     return gap
-
-
-def _ends(points: np.ndarray) -> int:
-    """Return the number of separate clusters of points: a handle or a rim meets its body at two ends."""
-    return int((torch.bincount(label_bodies(torch.from_numpy(points), gap=0.015)) >= 6).sum())
 
 
 class _Body:
@@ -144,7 +141,9 @@ def _one_body(a: _Body, b: _Body, gap: float) -> bool:
         return gap == 0.0
     small, large = (a, b) if a.count < b.count else (b, a)
     over = small.share_over(large)
-    if not _apart(small, large, over) and (gap < GAP or over > NESTED):
+    beside = over < 0.3 and all(body.foot < max(0.015, 0.5 * body.top) for body in (small, large))
+    apart = (beside and small.count > 0.1 * large.count) or _upon(small, large)  # side by side, or one upon the other
+    if not apart and (gap < GAP or over > NESTED):
         return True
     hull = Hull.of(torch.cat([a.hull.corners, b.hull.corners]))
     if hull.width < 0.025 and min(a.foot, b.foot) > 0.01:  # a standing ring from its edge: none of its parts stands
@@ -154,12 +153,6 @@ def _one_body(a: _Body, b: _Body, gap: float) -> bool:
     both = torch.cat([a.points, b.points])
     high = both[both[:, 2] > max(a.top, b.top) - 0.004, :2]  # only a hollow body has no top in its middle
     return float(hull.holds(high, -0.012).double().mean()) < 0.2
-
-
-def _apart(small: _Body, large: _Body, over: float) -> bool:
-    """Return whether two bodies that touch are two objects: side by side on the table, or one upon the other."""
-    beside = over < 0.3 and all(body.foot < max(0.015, 0.5 * body.top) for body in (small, large))
-    return (beside and small.count > 0.1 * large.count) or _upon(small, large)
 
 
 def _upon(small: _Body, large: _Body) -> bool:

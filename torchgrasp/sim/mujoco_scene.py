@@ -64,7 +64,8 @@ class MujocoScene(Scene):
 
     def _advance(self) -> Iterator[tuple[int, int, Callable[[], list[ContactPoint]]]]:
         """Advance by one timestep; yield each pair of bodies that touch, with a function that reads their contact."""
-        if self._diverged():
+        if self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].any():  # it has diverged
+            self.data.qpos[:] = self.data.xpos[:] = np.nan
             return
         self._mujoco.mj_step2(self.model, self.data)
         for k, (first, second) in enumerate(self.data.contact.geom.tolist()):
@@ -111,13 +112,6 @@ class MujocoScene(Scene):
             if not {self._body_of[first], self._body_of[second]} <= self._place_of.keys():
                 deepest = max(deepest, -float(distance))
         return deepest
-
-    def _diverged(self) -> bool:
-        """Return whether the simulation has diverged; all poses are then set to NaN."""
-        if self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].any():
-            self.data.qpos[:] = self.data.xpos[:] = np.nan
-            return True
-        return False
 
     def _pose(self, body: int) -> np.ndarray:
         """Return the pose (4, 4) of a body in the world's frame, given its index."""

@@ -28,7 +28,7 @@ from benchmarks.common import Options, Row, bench
 from torchgrasp.closure import ClosureResult
 from torchgrasp.control.tactile import joint_jacobian
 from torchgrasp.evaluation import close_hand
-from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import draw_push, seed_of
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.hand.hand import Hand
@@ -182,7 +182,7 @@ def _row(hand: str, name: str, lifts: Sequence[dict[str, Any]], base: Sequence[d
         for some, holdable in ((lifts, True), (base, True), (lifts, False))
     )
     held, before = (count_by((x["family"], x["status"] == "OK") for x in some) for some in (mine, first))
-    share, change = share_over(held), difference_over(held, before)
+    share, change = share_over(held), contrast_over([held, before], [1.0, -1.0])
     spent = [x["end"][1] / x["end"][0] for x in lifts if x["status"] == "OK" and x["end"][0]]
     most = statistics.median(spent) if spent else math.nan
     lost = dict(Counter(x["status"] for x in mine if x["status"] != "OK"))

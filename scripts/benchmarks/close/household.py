@@ -19,7 +19,7 @@ from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import PERTURBATIONS, Perturbation, find_perturbation, perturb_trial
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import PROTOCOLS, PoseNoise, close_hand
-from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.hand.load import load_hand
 
@@ -75,7 +75,7 @@ def _row(what: str, lifts: Sequence[Lift], base: Sequence[Lift], judged: bool) -
     slips = np.array([x.slip for x in lifts if x.held], dtype=float).reshape(-1, 2) * (1e3, math.degrees(1))
     median, most = np.quantile(slips, [0.5, 0.95], axis=0) if len(slips) else np.full((2, 2), math.nan)
     share, every = share_over(best), share_over(count_by((x.family, x.held) for x in lifts))
-    change = difference_over(best, first)
+    change = contrast_over([best, first], [1.0, -1.0])
     words = [f"best one {format_share(share)}", f"change {format_points(change)}"]
     words += [f"all ranks tried {format_share(every)}"] if any(x.rank > 0 for x in lifts) else []
     words.append(f"slip {median[0]:.1f} mm, {median[1]:.1f} deg; 95 % below {most[0]:.1f} mm, {most[1]:.1f} deg")

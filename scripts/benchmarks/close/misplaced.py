@@ -39,7 +39,7 @@ from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand
 from torchgrasp.closure import SensorModel
 from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, Truth, pull_grasp
-from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import error_from_object_pose, seed_of
 from torchgrasp.evaluation.views import choose_rows
@@ -135,7 +135,7 @@ def _rows(hand: str, condition: str, laws: Sequence[str], found: Sequence[Outcom
         if not mine:
             continue
         held, first = (count_by((x.family, x.held) for x in some) for some in (mine, base))
-        share, better = share_over(held), difference_over(first, held)
+        share, better = share_over(held), contrast_over([first, held], [1.0, -1.0])
         moved = median_over([(x.family, math.nan if x.moved is None else x.moved) for x in mine])
         lost = dict(Counter(x.status for x in mine if not x.held).most_common())
         words = [format_share(share), "moved {:.1f} mm [{:.1f}, {:.1f}]".format(*moved), *_forces(mine)]

@@ -14,7 +14,7 @@ from paper.tables6_7 import format_points
 from benchmarks.common import Options, Row, bench
 from torchgrasp.app.report.evaluation import list_causes
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, PoseNoise, Protocol, ViewScore, evaluate, summarise
-from torchgrasp.evaluation.intervals import count_by, difference_over, format_share, share_over
+from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 
@@ -104,7 +104,7 @@ def _agree(hand: str, first: Sequence[ViewScore], second: Sequence[ViewScore]) -
         keys = sorted(one.keys() & other.keys())
         same = share_over(count_by((one[key][0], one[key][1] == other[key][1]) for key in keys))
         there, here = (count_by(some[key] for key in keys) for some in (one, other))
-        apart = difference_over(here, there)
+        apart = contrast_over([here, there], [1.0, -1.0])
         words = f"{format_share(same)}; {share_over(there).value:.1%} in SAPIEN, MuJoCo {format_points(apart)}"
         differ = [(*key, one[key][1], other[key][1]) for key in keys if one[key][1] != other[key][1]]
         met = same.value >= LEAST_AGREED and abs(apart.value) <= MOST_APART

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks.common import mean_over
 from benchmarks.ground_truth import nearest_on_mesh, read_views, sample_mesh
-from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.files import format_columns
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape

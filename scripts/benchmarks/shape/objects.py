@@ -9,13 +9,12 @@ from typing import Literal
 import torch
 from tqdm import tqdm
 
-from benchmarks.common import Options, Row, bench, least_seconds
+from benchmarks.common import Options, Row, bench, least_seconds, mean_over
 from benchmarks.ground_truth import read_views
 from benchmarks.shape.accuracy import Row as View
 from benchmarks.shape.accuracy import format_groups, format_table, mean_row, measure_shape
 from benchmarks.shape.walls import measure_walls
 from torchgrasp.data import read_entry
-from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.shape.fit import fit_shape
 
 

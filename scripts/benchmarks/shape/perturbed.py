@@ -5,13 +5,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks.common import Options, Row, bench
+from benchmarks.common import Options, Row, bench, mean_over
 from benchmarks.ground_truth import read_views
 from benchmarks.perturb import PERTURBATIONS, find_perturbation, perturb_view
 from benchmarks.shape.accuracy import Row as View
 from benchmarks.shape.accuracy import measure_shape
 from torchgrasp.data import read_entry
-from torchgrasp.evaluation.intervals import mean_over
 from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.shape.fit import fit_shape
 

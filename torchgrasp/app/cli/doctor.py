@@ -53,12 +53,15 @@ class Doctor(Command):
 def find_parts() -> list[Finding]:
     """Return the state of every part of the installation."""
     hands = ", ".join(sorted(p.parent.name for p in hands_folder().glob("*/hand.toml")))
+    gpu = "none visible to torch; everything runs on the processor"  # no fault
+    if torch.cuda.is_available():
+        gpu = f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"
     return [
         Finding("torchgrasp", f"{__version__}, hands: {hands}"),
         Finding("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"),
         *(_package(name) for name in CORE),
         Finding("processor", f"{os.cpu_count()} cores; a command uses one, and --workers N uses N"),
-        _gpu(),
+        Finding("GPU", gpu),
         *(_simulator(name) for name in SIMULATORS),
         *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
         _dask(),
@@ -112,13 +115,6 @@ def _dask() -> Finding:
     need = "none; `torchgrasp campaign --scheduler` needs it: pip install 'torchgrasp[cluster]'"
     found = _package("distributed")
     return Finding(found.part, need) if found.fix else found
-
-
-def _gpu() -> Finding:
-    """Return the GPU that torch can use; a missing GPU is not a fault."""
-    if torch.cuda.is_available():
-        return Finding("GPU", f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}")
-    return Finding("GPU", "none visible to torch; everything runs on the processor")
 
 
 def _simulator(name: Simulator) -> Finding:

@@ -189,8 +189,10 @@ class Campaign(_Trials):
         with naming(workers=name), make_bar(len(list_names(self.objects, trials)), "job") as bar:
 
             def show(row: JobRow) -> None:
+                reason = "" if row.status is Status.OK else row.note or row.status.sentence
+                cells = row.object, row.view, row.executable, f"{row.passed}/{row.grasps}", reason
                 with bar.external_write_mode(sys.stdout):
-                    print_job(row)
+                    print(format_line(cells, (-12, -6, 5, 7, -1)), flush=True)
                 bar.update()
 
             data = run_campaign(self.objects, hand, self.out, spec, source, show)
@@ -203,10 +205,3 @@ class Campaign(_Trials):
             jobs = "1 job" if len(failed) == 1 else f"{len(failed)} jobs"
             print(f"{jobs} failed by no fault of the object ({reasons}): the same command tries again")
         return 1 if failed else 0
-
-
-def print_job(row: JobRow) -> None:
-    """Print one line for a finished job, which is one view of one object."""
-    reason = "" if row.status is Status.OK else row.note or row.status.sentence
-    numbers = row.executable, f"{row.passed}/{row.grasps}"
-    print(format_line((row.object, row.view, *numbers, reason), (-12, -6, 5, 7, -1)), flush=True)

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+Points = Float[np.ndarray, "n 3"]
+
 Direction = tuple[float, float, float]
 
 FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")
@@ -61,7 +63,7 @@ class Canvas:
         triangles = Triangles(corners, bent, shade, np.full(len(corners), lit))
         (self.transparent if transparent else self.solid).append(triangles)
 
-    def add_points(self, points: Float[np.ndarray, "n 3"], colors: Float[np.ndarray, "n 3"]) -> None:
+    def add_points(self, points: Points, colors: Points) -> None:
         """Add points as small balls, each in its colour."""
         from trimesh import creation
 
@@ -73,8 +75,8 @@ class Canvas:
 
     def add_arrows(
         self,
-        points: Float[np.ndarray, "n 3"],
-        directions: Float[np.ndarray, "n 3"],
+        points: Points,
+        directions: Points,
         length: float,
         colors: tuple[str, ...],
     ) -> None:
@@ -89,7 +91,7 @@ class Canvas:
             for part in (creation.icosphere(subdivisions=1, radius=0.13), shaft, head):
                 self.add_mesh(length * part.vertices @ turn.T + start, part.faces, color)
 
-    def add_table(self, corners: Float[np.ndarray, "n 3"], height: float | None) -> None:
+    def add_table(self, corners: Points, height: float | None) -> None:
         """Add an unshaded round table top at `height` [m], centred on `corners` in x and y. None adds nothing."""
         from trimesh import creation
 
@@ -104,9 +106,7 @@ class Canvas:
         """Return the picture that a camera sees, as pixels."""
         return render(concatenate(self.solid), concatenate(self.transparent), camera, size, rgb(PAPER))
 
-    def render_png(
-        self, corners: Float[np.ndarray, "n 3"], direction: Direction, bar: tuple[str, float, str] | None = None
-    ) -> bytes:
+    def render_png(self, corners: Points, direction: Direction, bar: tuple[str, float, str] | None = None) -> bytes:
         """Return a PNG that shows all `corners` [m]; `bar` is title, largest value and colour map of a bar below."""
         from PIL import Image
 
@@ -116,9 +116,7 @@ class Canvas:
         return encode_png(image)
 
 
-def frame_camera(
-    corners: Float[np.ndarray, "n 3"], direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE
-) -> Camera:
+def frame_camera(corners: Points, direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE) -> Camera:
     """Return a camera in `direction` that sees all `corners`; the lowest fraction `drop` of its picture stays empty."""
     angle = np.deg2rad(24.0)  # a long lens distorts little
     x, y, z = direction
@@ -241,7 +239,7 @@ def rgb(color: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def map_colors(values: Float[np.ndarray, " n"], name: str) -> Float[np.ndarray, "n 3"]:
+def map_colors(values: Float[np.ndarray, " n"], name: str) -> Points:
     """Return the colours that the matplotlib colour map `name` gives to values in [0, 1]."""
     import matplotlib
 

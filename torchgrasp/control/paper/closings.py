@@ -16,6 +16,8 @@ from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
 from torchgrasp.geometry.linalg import limit_norm
 from torchgrasp.plan.forces import grasp_map, internal_forces
 
+Rows = Float[Tensor, "*b 3 3"]
+
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
 
 POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
@@ -160,23 +162,19 @@ def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, 
     return torch.cat([force, ROTATION_STIFFNESS * error], -1)
 
 
-def shared_forces(
-    points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
-) -> Float[Tensor, "*b 3 3"]:
+def shared_forces(points: Rows, wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]) -> Rows:
     """Return the smallest fingertip forces [N] that exert a wrench, all scaled down if one would exceed `most` [N]."""
     forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
     largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
 
 
-def spring_forces(
-    points: Float[Tensor, "*b 3 3"], lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
-) -> Float[Tensor, "*b 3 3"]:
+def spring_forces(points: Rows, lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]) -> Rows:
     """Return the forces [N] of springs along the sides of the triangle of fingertips, with rest `lengths` [m]."""
     return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
 
 
-def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+def side_lengths(points: Rows) -> Float[Tensor, "*b 3"]:
     """Return the lengths [m] of the sides (0, 1), (1, 2) and (2, 0) of a triangle."""
     return torch.linalg.vector_norm(points.roll(-1, dims=-2) - points, dim=-1)
 
