@@ -130,8 +130,11 @@ class ClosingReference(Value):
         )
         squeeze = forces.press(grasp.joints, jacobian, desired, forces.joint_stiffness(hand, kp)).joints
         pose, opened, joints = grasp.obj_from_hand[0], grasp.pregrasp[0], grasp.joints[0]
-        stiffness, approach = forces.drive_stiffness(hand, kp), _approach_in_hand(grasp)
-        plan = cls(hand, stiffness, pose, opened, joints, squeeze[0], normals[0], gains, approach)
+        direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
+        approach = unit(direction) if bool((direction != 0.0).any()) else None  # in the hand's frame
+        plan = cls(
+            hand, forces.drive_stiffness(hand, kp), pose, opened, joints, squeeze[0], normals[0], gains, approach
+        )
         friction = _number(grasp, "friction")
         told = {} if friction is None else {"friction": friction}
         return dataclasses.replace(plan, distance_variance=_distance_variance(grasp), **told)
@@ -228,12 +231,6 @@ def _number(grasp: Grasps, name: str) -> float | None:
     if not number > 0.0:
         raise BadArgument(f"grasp.meta[{name!r}]", repr(text), "a positive number")
     return number
-
-
-def _approach_in_hand(grasp: Grasps) -> Float[Tensor, "3"] | None:
-    """Return the unit approach direction of one grasp in the hand's frame, or None if the grasp has no approach."""
-    direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
-    return unit(direction) if bool((direction != 0.0).any()) else None
 
 
 @checked

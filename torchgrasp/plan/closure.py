@@ -220,7 +220,11 @@ def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: 
     rows = torch.nonzero((torch.isfinite(points) & torch.isfinite(normals)).flatten(1).all(1))[:, 0]
     wrench = wrenches(points[rows], normals[rows], friction, FIRST_EDGES).flatten(1, 2)
     if guess is not None:
-        proven = _balances(wrench, _corrected(wrench, guess[rows]))
+        phi = guess[rows]  # corrected to balance the wrenches
+        weighted = phi.square()[..., None] * wrench
+        factor, _ = torch.linalg.cholesky_ex(wrench.mT @ weighted)
+        dual = torch.cholesky_solve((phi[:, None] @ wrench).mT, factor)
+        proven = _balances(wrench, phi - (weighted @ dual)[..., 0])
         closed[rows[proven]] = True
         rows, wrench = rows[~proven], wrench[~proven]
     for _ in range(ROUNDS):
@@ -238,14 +242,6 @@ def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: 
 def _balances(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Bool[Tensor, "b"]:
     """Return for each contact set whether the coefficients `phi` are positive and sum its wrenches to zero."""
     return ((phi[:, None] @ wrench)[:, 0].abs().amax(-1) <= BALANCED) & (phi.amin(-1) > BALANCED)
-
-
-def _corrected(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Float[Tensor, "b m"]:
-    """Return coefficients that balance the wrenches, as near as possible to `phi`; they may be negative."""
-    weighted = phi.square()[..., None] * wrench
-    factor, _ = torch.linalg.cholesky_ex(wrench.mT @ weighted)
-    dual = torch.cholesky_solve((phi[:, None] @ wrench).mT, factor)
-    return phi - (weighted @ dual)[..., 0]
 
 
 def most_opposing(

@@ -120,7 +120,9 @@ class Planner:
                 solved = self._solve_joint(plan, batch.tried, report, last=number == len(batches))
             else:
                 assert plan is not None
-                solved = self._solve_contact_first(plan, batch.tried, report)
+                found = find_contacts(problem, plan, batch.tried, report.note)
+                solve = solve_as_paper if request.mode == "paper" else solve_contact_first
+                solved = solve(problem.reach(found.contacts, found.certificate), found.seeds)
             grasps = rank(problem, solved)
             late = time.monotonic() >= deadline
             if late:
@@ -129,12 +131,6 @@ class Planner:
             yield dataclasses.replace(grasps, meta={"starts": str(planned)})
             if late:
                 return
-
-    def _solve_contact_first(self, plan: ContactPlan, tried: int, report: "Report") -> Grasps:
-        """Return grasps on fixed contacts, from initial hand postures that the learned model gives."""
-        found = find_contacts(self.problem, plan, tried, report.note)
-        solve = solve_as_paper if self.problem.request.mode == "paper" else solve_contact_first
-        return solve(self.problem.reach(found.contacts, found.certificate), found.seeds)
 
     def _solve_joint(self, plan: ContactPlan | None, tried: int, report: "Report", last: bool) -> Grasps:
         """Return grasps on the most promising contact sets so far, and on sets that earlier batches left unsolved."""

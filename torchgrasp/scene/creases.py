@@ -26,7 +26,9 @@ def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h
     for number, box in enumerate(boxes, start=1):
         mask = found[box] == number
         scale = float(image.intrinsics[0, 0]) / float(image.depth[box][torch.from_numpy(mask)].median())
-        own = _join_parts(_divide(points[box], mask, scale * REACH, least), points[box])
+        own = _divide(points[box], mask, scale * REACH, least)
+        joined = [(a, b) for a, b in _borders(own) if not _is_concave(own, points[box], a, b)]
+        own = number_components(np.array(joined, dtype=np.int64).reshape(-1, 2), int(own.max()) + 1)[own]
         new = torch.from_numpy(own.astype(np.int64))
         parts[box] = torch.where(new > 1, last + new - 1, parts[box])
         last += max(0, int(own.max()) - 1)
@@ -74,13 +76,6 @@ def _normals(points: np.ndarray, mask: np.ndarray, step: int) -> tuple[np.ndarra
     normal = np.cross(*sides)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
     return np.where((normal * points).sum(-1, keepdims=True) > 0, -normal, normal), known
-
-
-def _join_parts(parts: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return each pixel's part after parts that do not meet at a concave angle are joined; numbers start from 1."""
-    joined = [(a, b) for a, b in _borders(parts) if not _is_concave(parts, points, a, b)]
-    pairs = np.array(joined, dtype=np.int64).reshape(-1, 2)
-    return number_components(pairs, int(parts.max()) + 1)[parts]
 
 
 def _borders(parts: np.ndarray) -> list[tuple[int, int]]:

@@ -37,7 +37,9 @@ def merge_pieces(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, ju
     thin = _thinned(image, pieces, whole)
     names, count = thin[thin > 0].unique(return_counts=True)
     order = torch.argsort(thin[thin > 0], stable=True)
-    parts = _over_table(image, table)[thin > 0][order].split(count.tolist())
+    axes, points = torch.stack(across(table.normal.double()), -1), image.points()
+    points = torch.cat([points @ axes, table.height(points)[..., None]], -1)  # z is the height above the table
+    parts = points[thin > 0][order].split(count.tolist())
     gap = _gaps([KDTree(part.numpy()) for part in parts])
     large = [k for k in range(len(parts)) if len(parts[k]) >= 30]
     bodies = _joined([_Body((k,), parts[k], int(whole[names[k]])) for k in large], gap, floating[names].tolist())
@@ -88,12 +90,6 @@ def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> lis
         if body in done and nearest is not body and between(body, nearest) < reach and not _upon(body, nearest):
             done = [other for other in others if other is not nearest] + [body + nearest]
     return done
-
-
-def _over_table(image: DepthImage, table: Plane) -> Float[Tensor, "h w 3"]:
-    """Return the points of all pixels in a frame whose z is the height above the table."""
-    axes, points = torch.stack(across(table.normal.double()), -1), image.points()
-    return torch.cat([points @ axes, table.height(points)[..., None]], -1)
 
 
 def _gaps(trees: list[Any]) -> np.ndarray:

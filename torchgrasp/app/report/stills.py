@@ -62,7 +62,8 @@ def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direct
     points, labels = to_array(scene.points[others]), scene.labels[others].cpu().numpy()
     corners = np.concatenate([corners, points])
     if len(points):
-        canvas.add_points(_thinned(points, 4000), _label_colors(_thinned(labels, 4000)))
+        palette = np.stack([paint.rgb(name) for name in paint.OBJECTS])
+        canvas.add_points(_thinned(points, 4000), palette[(_thinned(labels, 4000) - 1) % len(palette)])
     canvas.add_table(corners, None if scene.table is None else 0.0)
     return canvas.render_png(corners, direction)
 
@@ -180,12 +181,6 @@ def _joint_colors(hand: Hand) -> list[str]:
     moved = [{finger_of_joint[j] for j in torch.nonzero(row)[:, 0].tolist()} for row in hand.actuated.coupling.T]
     colors = {PARKED: paint.HAND, **dict(enumerate(paint.FINGERS))}
     return [colors[min(fingers)] if len(fingers) == 1 else paint.HAND for fingers in moved]
-
-
-def _label_colors(labels: np.ndarray) -> Float[np.ndarray, "*b 3"]:
-    """Return the colour of the object with each label; label 0 gives the table's colour."""
-    palette = np.stack([paint.rgb(name) for name in (paint.TABLE, *paint.OBJECTS)])
-    return palette[np.where(labels > 0, 1 + (labels - 1) % len(paint.OBJECTS), 0)]
 
 
 def _thinned(rows: np.ndarray, most: int) -> np.ndarray:

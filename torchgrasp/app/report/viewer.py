@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, Direction, map_colors
+from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, map_colors
 from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, render
 from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
@@ -92,12 +92,14 @@ def describe(run: Run) -> dict[str, Any]:
     """Return the contents of the 3D page as a dictionary for JSON, in an upright frame."""
     sentence, run = verdict(run), run.upright()
     best, scene = run.executable[:MOST_GRASPS], run.scene
+    x, y, z = facing(best[0]) if len(best) else view_of(run.cloud)
+    eye = np.array([x, y, max(z, 0.35 * float(np.hypot(x, y)))])  # raised to look from above
     return {
         "title": f"Grasps of the {run.object_name} with the {run.hand.name} hand",
         "source": str(run.source),
         "verdict": sentence,
         "good": bool(run.closure.held if run.closure is not None else len(best) > 0),
-        "eye": _eye(facing(best[0]) if len(best) else view_of(run.cloud)),
+        "eye": (eye / np.linalg.norm(eye)).tolist(),
         "table": None if run.spec.table is None else TABLE,
         "object": OBJECT,
         "fingers": [list(pair) for pair in zip(run.hand.tips.names, FINGERS, strict=False)],
@@ -118,13 +120,6 @@ def describe(run: Run) -> dict[str, Any]:
         "grasps": _grasps(run.hand, best),
         "replay": None if run.closure is None or run.mesh is None else _replay(run, run.closure),
     }
-
-
-def _eye(direction: Direction) -> list[float]:
-    """Return the unit direction from the object to the initial camera: `direction`, raised to look from above."""
-    x, y, z = direction
-    eye = np.array([x, y, max(z, 0.35 * float(np.hypot(x, y)))])
-    return (eye / np.linalg.norm(eye)).tolist()
 
 
 def _points(points: Float[Tensor, "n 3"]) -> dict[str, object]:
