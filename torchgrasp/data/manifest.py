@@ -10,6 +10,7 @@ folder is read.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -220,10 +221,7 @@ def _file(objects: Path | str, name: str, file: str) -> Path:
 
 def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
     """Return the unchecked manifest entries, by name, of the objects in `only`; an empty `only` selects all."""
-
-    def refuse(found: str, allowed: str) -> DatasetError:
-        return DatasetError("objects", found, allowed)
-
+    refuse = functools.partial(DatasetError, "objects")
     path = Path(objects) / "manifest.json"
     allowed = "a folder with a manifest.json in UTF-8 (`torchgrasp cloud views` makes one from meshes)"
     top = read_json(path, refuse, allowed).entries()

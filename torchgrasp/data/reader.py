@@ -149,10 +149,7 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     (torch.Size([100, 3]), 'carton', 1)
     """
     folder, most_card = Path(folder), 256 * 1024**2  # largest card in bytes
-
-    def refuse(found: str, allowed: str) -> ModelFileError:
-        return ModelFileError("folder", found, allowed)
-
+    refuse = functools.partial(ModelFileError, "folder")
     card = read_json(folder / CARD, refuse, "a folder that `torchgrasp campaign` finished", most_card)
     fields = card.entries("campaign", "jobs_in_shard", "jobs")
     fields["campaign"].text()

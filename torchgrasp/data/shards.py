@@ -1,6 +1,7 @@
 """A shard: one file with the records of several jobs of a campaign. A job is one object and view."""
 
 import dataclasses
+import functools
 import itertools
 import json
 from collections.abc import Sequence
@@ -96,10 +97,7 @@ def load_shard(path: Path, meta: dict[str, str]) -> Shard:
     records, found = read_value(path, KIND, Records)
     if (other := {key: found.get(key) for key in meta}) != meta:
         raise ModelFileError("path", f"{path} of {other}", f"a shard of {meta}")
-
-    def refuse(found: str, allowed: str) -> ModelFileError:
-        return ModelFileError("path", found, allowed)
-
+    refuse = functools.partial(ModelFileError, "path")
     try:
         jobs = json.loads(found.get("jobs", ""))
     except (ValueError, RecursionError) as error:

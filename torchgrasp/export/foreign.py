@@ -7,6 +7,7 @@ trust:
     numpy.savez("0.npz", grasp_qpos=content["grasp_qpos"], pregrasp_qpos=content["pregrasp_qpos"])
 """
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -31,6 +32,7 @@ from torchgrasp.values import Contacts, Grasps
 
 MOST_GRASPS = 100_000  # most grasps of a file: more are no plan of one object
 FAR = 10_000.0  # largest number of a pose or posture [mm, rad] in a JSON file
+_refuse = functools.partial(ModelFileError, "path")  # the error of a bad file of grasps
 
 Quaternion = Literal["wxyz", "xyzw"]
 
@@ -86,11 +88,6 @@ def read_foreign(
     if len(pose) != len(dofs):
         raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
     return ForeignGrasps(torch.tensor(dofs[:, places]), _poses(pose, quaternion), None)
-
-
-def _refuse(found: str, allowed: str) -> ModelFileError:
-    """Return the error to raise for a bad file of grasps: what was found, and what is allowed."""
-    return ModelFileError("path", found, allowed)
 
 
 def _read_own(rows: Field, hand: Hand) -> ForeignGrasps:

@@ -161,7 +161,10 @@ def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "
     pushes, slides = push[..., :, None] * push[..., None, :], slide.mT @ slide
     start = torch.einsum("bfik,bfi->bk", basis, -preferred[..., None] * normals)
     pulls = ~((push @ start[..., None])[..., 0] > 0).all(1)
-    found = _pushing_forces(points[pulls], normals[pulls])
+    wrench = wrenches(points[pulls], normals[pulls], MAX_FRICTION, edges=4)
+    phi, _ = solve_closure_lp(wrench.flatten(1, 2))
+    found = (phi.unflatten(1, wrench.shape[1:3])[..., None] * wrench[..., :3]).sum(2)
+    found = torch.where((phi.amin(-1) > 0)[:, None, None], found, torch.nan)
     start = start.index_put((pulls,), torch.einsum("bfik,bfi->bk", basis[pulls], found))
     linear = (2 / preferred[..., None] * push).sum(1)
     z = start * (2 * points.shape[1] / (linear * start).sum(1))[:, None]
@@ -189,14 +192,6 @@ def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "
         # Farther from the centre tau would fall faster than the steps can follow.
         tau = torch.where(decrement < 1.0, ratio + (KEPT * (tau - ratio)).clamp(min=slack), tau)
     return (basis @ z[:, None, :, None])[..., 0]
-
-
-def _pushing_forces(points: Vectors, normals: Vectors) -> Vectors:
-    """Return balanced forces that push at every contact; NaN where none exist within `MAX_FRICTION`."""
-    wrench = wrenches(points, normals, MAX_FRICTION, edges=4)
-    phi, _ = solve_closure_lp(wrench.flatten(1, 2))
-    forces = (phi.unflatten(1, wrench.shape[1:3])[..., None] * wrench[..., :3]).sum(2)
-    return torch.where((phi.amin(-1) > 0)[:, None, None], forces, torch.nan)
 
 
 def _size(push: Push, slide: Slide, z: Float[Tensor, "b l k"]) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:
