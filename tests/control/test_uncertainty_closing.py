@@ -172,6 +172,31 @@ def test_fingers_slide_along_the_table_to_the_rim_of_a_low_object():
     assert float(height[left < touch + 0.003].max()) < 0.0005  # so low even where the rim is met 3 mm early
 
 
+def test_a_raised_palm_goes_down_as_coupled_fingers_close_upwards():
+    """Each finger has one joint, with which its tip goes inwards and up by 0.6: only the palm keeps it at the table."""
+    slope, coupling = torch.tensor([0.5, 0.5, 0.5]).double(), torch.zeros(9, 3).double()
+    for i in range(3):
+        coupling[3 * i, i], coupling[3 * i + 2, i] = -NORMALS[i, 0], 0.6
+    normals = torch.stack([(1 - slope**2).sqrt() * NORMALS[:, 0], 0 * slope, slope], -1)
+    rim = TARGET * real([1.0, 1.0, 0.0]) + real([0.0, 0.0, 0.005])
+    gains = dataclasses.replace(GAINS, target=rim, covariance=surface_covariance(normals, real([0.004] * 3)))
+    low = dataclasses.replace(reference(coupling), normals=normals, gains=gains, table=Plane(real([0, 0, 1]), 0.0))
+    rise, start = real([0, 0, 0.006]), rim + 0.01 * normals + 0.01 * NORMALS - real([0, 0, 0.006])
+    assert not low.rise.any()  # its links are far away
+    raised = dataclasses.replace(low)
+    vars(raised)["rise"] = rise
+    law, joints, paths = UncertaintyClosing(raised, RIGID_ARM), torch.zeros(9).double(), [start + rise]
+    while float(((paths[-1] - rim) * NORMALS).sum(-1).max()) > 0.01 * math.sqrt(0.75):  # until all tips touch
+        joints = law(dataclasses.replace(observation(joints=joints), tips=paths[-1] - law.palm), PERIOD)
+        paths.append(start + law.palm + joints.reshape(3, 3))
+    height = torch.stack(paths)[..., 2] - 0.01
+    assert float(height.min()) > -1e-3 and float(height.amin(1).max()) < 1e-3 and float(height.max()) < 3e-3
+    assert float(law.palm[2]) < 0.003 and torch.equal(law.palm[:2], torch.zeros(2).double())
+    law = UncertaintyClosing(raised, RIGID_ARM).press()
+    law(dataclasses.replace(observation(), tips=start), PERIOD)
+    assert torch.equal(law.palm, rise)
+
+
 def test_joints_that_would_be_too_fast_slow_down_together():
     velocity = real([[2.0, 1.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
     free, slow = (

@@ -7,7 +7,7 @@ import torch
 
 from tests.make import distance_field, touched_contacts
 from torchgrasp import Certificate, Status, load_hand
-from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
+from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates, raise_hand
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 
@@ -58,3 +58,17 @@ def test_a_hand_that_cannot_open_or_is_in_a_cage_says_so(touching):
     cage = distance_field(lambda x: 0.17 - (x - middle).norm(dim=-1), middle, 0.4, 0.01)
     caged = dataclasses.replace(problem, world=CollisionWorld(cage))
     assert check_candidates(caged, candidate).status.tolist() == [Status.NO_APPROACH]
+
+
+def test_an_opened_hand_rises_until_it_clears_the_table_by_a_millimetre():
+    """The opened Barrett hand points down; its lowest sphere is 5 mm in, 5 mm over and 40 mm in the table: too much."""
+    hand = load_hand("barrett")
+    joints = torch.tensor([[0.3, 0.5, 0.5, 0.5]], dtype=torch.float64).expand(3, -1)
+    pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)).expand(3, -1, -1).clone()
+    height = -hand.sphere_centres(joints)[..., 2] - hand.collision_spheres.radius
+    pose[:, 2, 3] = torch.tensor([0.015, 0.025, -0.02], dtype=torch.float64) - height.amin(1)
+    raised = raise_hand(hand, Configuration(joints, pose), CollisionWorld(table=0.02)).obj_from_hand
+    moved = (raised - pose)[:, :3, 3]
+    expected = torch.tensor([[0, 0, 0.006], [0, 0, 0], [0, 0, 0]], dtype=torch.float64)
+    torch.testing.assert_close(moved, expected, atol=1e-9, rtol=0)
+    assert torch.equal(raise_hand(hand, Configuration(joints, pose), CollisionWorld()).obj_from_hand, pose)

@@ -98,7 +98,7 @@ class GraspController:
         self.guard = GuardedApproach(reference, self.options, approach, self.felt) if approach else None
         self._make_closing = functools.partial(make_closing, reference, self.mode, self.options)
         self._begin(self._make_closing())
-        self.targets = Targets(reference.expand(reference.pregrasp), self.path, approach)
+        self.targets = Targets(reference.expand(reference.pregrasp), self.path + reference.rise, approach)
 
     def _begin(self, closing: Closing) -> None:
         """Start a new attempt to close the hand, controlled by `closing`, and count it."""
@@ -225,7 +225,8 @@ class GraspController:
         if self.check.judged and not self.check.secure:
             assert isinstance(self.closing, UncertaintyClosing)
             reach, palm = 0.0 if self.length else self.options.palm_reach, self.closing.palm
-            begun = palm if bool(observation.tactile.contact.any()) else self.closing.begun
+            raised = bool(self.reference.rise.any())
+            begun = palm if bool(observation.tactile.contact.any()) and not raised else self.closing.begun
             self.reopening = Reopening(self.reference, self.check.displacement, observation.joints, palm, begun, reach)
             self.hold, self.check, self.pressed = None, None, 0.0
 

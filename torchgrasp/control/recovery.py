@@ -15,7 +15,7 @@ from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.object_pose import Localization, Touches
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.sensing import TORQUE_NOISE
-from torchgrasp.control.tactile import STILL, Observation, low_pass
+from torchgrasp.control.tactile import Observation, low_pass
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
@@ -57,7 +57,7 @@ class GuardedApproach:
         assert reference.approach is not None
         self.reference, self.options, self.length, self.direction = reference, options, length, reference.approach
         self.left, self.speed, self.retreat, self.stops = length, 0.0, 0.0, 0
-        self.palm, self.goal, self.displacement = STILL, STILL, torch.zeros(6, dtype=torch.float64)
+        self.palm, self.goal, self.displacement = reference.rise, reference.rise, torch.zeros(6, dtype=torch.float64)
         self.time, self.feeling = 0.0, False
         self.rest, self.inertia = None, torch.zeros_like(reference.kp)
         if after is not None:
@@ -127,7 +127,7 @@ class GuardedApproach:
     def _turn_to(self, displacement: Float[Tensor, "6"]) -> None:
         """Let the palm follow a displacement of the object, after a retreat as far as the palm then moves."""
         self.displacement = displacement
-        self.goal = palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
+        self.goal = self.reference.rise + palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
         way = float(torch.linalg.vector_norm(self.goal - self.palm))
         self.retreat = max(self.retreat, min(self.left + way, self.length))
 
@@ -204,7 +204,7 @@ class Reopening:
     ) -> None:
         self.displacement, self.start, self.opened = displacement, joints, reference.expand(reference.pregrasp)
         self.palm, self.closed, self.begun, self.time = palm, palm, begun, 0.0
-        self.goal = palm_goal(displacement[:3], reference.table, reach) if reach else begun
+        self.goal = reference.rise + palm_goal(displacement[:3], reference.table, reach) if reach else begun
 
     @property
     def done(self) -> bool:

@@ -13,12 +13,13 @@ from torchgrasp.base import Value
 from torchgrasp.checks import ANY, Force, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closure import ClosingGains, SensorModel
 from torchgrasp.control import forces, law
-from torchgrasp.control.tactile import Observation
+from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.hand.collision_shapes import rise_of
 from torchgrasp.hand.hand import Hand
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps
@@ -161,6 +162,15 @@ class ClosingReference(Value):
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
         """Return the actuated joints [rad], given the positions of all joints of the URDF [rad]; NaN is allowed."""
         return joints[self._actuated]
+
+    @functools.cached_property
+    def rise(self) -> Float[Tensor, "3"]:
+        """How far [m] the opened hand is above its planned pose before it closes, so that no link is in the table."""
+        if self.table is None:
+            return STILL
+        spheres = self.hand.collision_spheres
+        height = self.table.height(self.hand.sphere_centres(self.pregrasp))
+        return rise_of(height, spheres.radius.double()) * self.table.normal
 
     @functools.cached_property
     def _actuated(self) -> list[int]:

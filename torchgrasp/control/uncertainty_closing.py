@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.closure import ClosingOptions
-from torchgrasp.control.law import POSITION_FLOOR, POSITION_RATE, blend, stay_above, tip_velocity
+from torchgrasp.control.law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, stay_above, tip_velocity
 from torchgrasp.control.object_pose import ContactPlanes
 from torchgrasp.control.paper.closings import SETTLED, Settled, strongest_lead
 from torchgrasp.control.reference import ClosingReference, next_target
@@ -37,13 +37,15 @@ class UncertaintyClosing:
     * A finger without a working sensor rests at its estimated contact until the others touch. Then it searches until
       its drives feel a contact, or until it is three standard deviations beyond the contact.
     * Fingertips whose contacts are on the rim of a low object go down to the table, and slide along it to the object.
+    * A palm that begins above its planned pose (`ClosingReference.rise`) goes down as far as the fingers' arcs go up.
     * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers close.
     """
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:
         self.reference, self.waits, self.reach = reference, options.wait, options.palm_reach
         self.planes = ContactPlanes(reference) if options.pose_estimate else None
-        self.begun = self.palm = STILL  # displacement [m] of the palm when the closing began, and now
+        self.begun = self.palm = reference.rise  # displacement [m] of the palm when the closing began, and now
+        self.raised = bool(self.palm.any())
         self.displacement = torch.zeros(6, dtype=torch.float64)  # of the object [m, rad]
         self.touched = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
         self.alive, self.quick = reference.alive, reference.sensor.kind == "tactile" and reference.sensor.noise <= 1.0
@@ -66,7 +68,7 @@ class UncertaintyClosing:
 
     def press(self) -> "UncertaintyClosing":
         """Let all fingers, even waiting ones, press with their desired forces; keep the palm at rest; return `self`."""
-        self.waits, self.reach = False, 0.0
+        self.waits, self.reach, self.raised = False, 0.0, False
         return self
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
@@ -98,10 +100,11 @@ class UncertaintyClosing:
             height = reference.table.height(tips) - reference.hand.tips.radius
             velocity = stay_above(velocity, height, reference.table.normal)
             velocity = slide_along(velocity, height, reference.table.normal, self.low)
-        self.palm = self.palm + period * drift
+        velocity, descent = self._descend(velocity - drift, observation, period)
+        self.palm = self.palm + period * (drift + descent)
         lead = LEAD * (1 + self.waiting / 0.25) if self.waits else self.strongest  # grows while others are awaited
         fastest = 0.8 if bool(self.low.any()) else math.inf  # [rad/s]: faster joints lag, and tips leave the table
-        self.target = next_target(reference, self.target, velocity - drift, observation, lead, period, fastest)
+        self.target = next_target(reference, self.target, velocity, observation, lead, period, fastest)
         return reference.expand(self.target)
 
     def _follow(self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]) -> tuple[Tensor, Tensor]:
@@ -112,8 +115,28 @@ class UncertaintyClosing:
         drift = STILL
         if self.reach:
             goal = limit_norm(self.displacement[:3], self.reach)
-            drift = limit_norm(6.0 * (goal - self.palm), PALM_SPEED)
+            drift = limit_norm(6.0 * self._level(goal - self.palm), PALM_SPEED)
         return self.planes.moved(self.displacement), drift
+
+    def _level(self, way: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+        """Return a vector, or its part along the table if the palm began above its planned pose."""
+        table = self.reference.table
+        return way - (way @ table.normal) * table.normal if self.raised and table is not None else way
+
+    def _descend(
+        self, velocity: Float[Tensor, "f 3"], observation: Observation, period: float
+    ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "3"]]:
+        """Return velocities [m/s] of fingertips in the hand, and of a palm that began raised.
+
+        Then the fingers move their tips along the table only. The palm moves along its normal, so that no tip is lower
+        than it should be.
+        """
+        if not self.raised or self.reference.table is None:
+            return velocity, STILL
+        up, jacobian = self.reference.table.normal, observation.jacobian @ self.reference.hand.actuated.coupling
+        flat = jacobian - up[:, None] * (up @ jacobian)[:, None]
+        made = jacobian @ joint_step(flat, velocity - (velocity @ up)[:, None] * up, period) / period
+        return made, limit_norm(((velocity - made) @ up).amax() * up, PALM_SPEED)
 
     def _without_sensor(
         self, observation: Observation, ahead: Float[Tensor, "f"], contact: Bool[Tensor, "f"], period: float

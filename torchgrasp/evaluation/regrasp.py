@@ -146,15 +146,16 @@ class _CheckedLift(_Lift):
         """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift failed."""
         status, run, length = super()._put_down(time, rising), self.run, self.spec.approach
         joints, palm, here = run.observation.joints, run.controller.targets.palm, torch.zeros(6, dtype=torch.float64)
-        opening = Reopening(run.robot.reference, here, joints, palm, palm, reach=0.0)
+        reference = run.robot.reference
+        opening = Reopening(reference, here, joints, palm, palm + reference.rise, reach=0.0)
         while not opening.done:
-            run.robot.tick(Targets(opening(run.robot.period), palm))
+            run.robot.tick(Targets(opening(run.robot.period), opening.palm))
             self._record()
         ticks = run.robot.ticks(0.6)
         for k in range(2 * ticks):
             share, rate = smooth_step(min((k + 1) / ticks, 1.0))
             run.scene.approach(length * share, -length * rate / (ticks * run.robot.period))
-            run.robot.tick(Targets(opening.opened, palm))
+            run.robot.tick(Targets(opening.opened, opening.palm))
             self._record()
         return self._verdict() if self.check.lost else status
 

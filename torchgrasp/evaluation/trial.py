@@ -123,7 +123,8 @@ class TrialDriver:
             height=None if truth.table is None else 0.0,
             neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in truth.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
-            yields=spec.components.palm_reach + (0.0 if truth.camera is None else 1.5 * REACH),
+            yields=spec.components.palm_reach + (0.0 if truth.camera is None else 1.5 * REACH)
+            + float(self.reference.rise.norm()),
         )  # fmt: skip
 
     def _body(self, given: "Solid", parts: "Sequence[trimesh.Trimesh] | None", mass: float | None = None) -> Body:
@@ -172,20 +173,20 @@ class TrialRun:
         self.slide = None if slide is None else (world_from_obj @ slide.to("cpu", torch.float64)).numpy()
         guarded = spec.approach if spec.components.stops and can_guard(driver.reference) else 0.0
         self.controller = GraspController(driver.reference, spec.closing, spec.pressing, spec.options, guarded)
-        scene_spec = driver.scene_spec if trial.truth.camera is None else self._relook(driver, trial.truth.camera)
-        self.scene = open_scene(scene_spec, spec.simulator)
+        if trial.truth.camera is not None:
+            self._relook(driver, trial.truth.camera)
+        start = driver.scene_spec.world_from_hand[:3, :3] @ self.controller.targets.palm.numpy()
+        self.scene = open_scene(dataclasses.replace(driver.scene_spec, start=tuple(start.tolist())), spec.simulator)
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
         self.overlap, self.slid = self.scene.penetration(), np.zeros(3)
 
-    def _relook(self, driver: TrialDriver, camera: Float[Tensor, "4 4"]) -> SceneSpec:
-        """Show the controller what a camera sees; return the scene with the hand at the new start of its path."""
+    def _relook(self, driver: TrialDriver, camera: Float[Tensor, "4 4"]) -> None:
+        """Show the controller what a camera sees."""
         seen_from, scene_spec = driver.reference.obj_from_hand.numpy(), driver.scene_spec
         mesh = scene_spec.mesh.copy()
         mesh.apply_transform(seen_from @ np.linalg.inv(scene_spec.world_from_hand))  # the robot takes its pose for true
         self.controller.relook(partial_view(mesh, camera, seed=seed_of(driver.trial.seed, "relook")))
-        start = scene_spec.world_from_hand[:3, :3] @ self.controller.targets.palm.numpy()
-        return dataclasses.replace(scene_spec, start=tuple(start.tolist()))
 
     @property
     def starts(self) -> bool:
