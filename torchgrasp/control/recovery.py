@@ -228,8 +228,8 @@ class LiftCheck:
     """Feel while a closed hand rises, and holds, whether it loses the object; `lost` then stays true.
 
     The object is lost if fewer than two fingertips touch, and these carry hardly any load along the table's normal. The
-    hand will lose the object if two fingertips slide along it before the hand has risen to the height `low` [m]. Only
-    touches count for binary sensors, or without a table. Broken sensors count as touching.
+    hand will lose the object if two fingertips slide along it in the first 20 mm of the lift. Only touches count for
+    binary sensors, or without a table. Broken sensors count as touching.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.control import no_contact, observe
@@ -238,8 +238,6 @@ class LiftCheck:
     >>> LiftCheck(reference)(observe(reference.hand, reference.joints, no_contact()), height=0.02, period=0.01)
     True
     """
-
-    low = 0.02
 
     @checked
     def __init__(self, reference: ClosingReference) -> None:
@@ -250,9 +248,9 @@ class LiftCheck:
     @checked
     def __call__(self, observation: Observation, height: float, period: Annotated[float, Range(1e-5, 1.0)]) -> bool:
         """Return `lost` at the end of a tick of `period` [s], in which the hand has risen to `height` [m]."""
-        least, first, slip = 0.2, 0.01, 0.0015  # load [N], height [m] from which touches count, slide [m]
+        least, first, low, slip = 0.2, 0.01, 0.02, 0.0015  # load [N], heights of touches and slides, slide [m]
         tactile = observation.tactile
-        if height <= self.low:
+        if height <= low:
             self.slid = self.slid + period * tactile.sliding
         if self.table is not None:
             load = float((tactile.forces @ self.table.normal.double()).sum())

@@ -105,10 +105,10 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
     return run_lift(TrialDriver(trial, TrialSpec() if spec is None else spec))
 
 
-def run_lift(driver: TrialDriver, low: float = 0.0) -> ClosureResult:
-    """Run a lift trial in a fresh scene; the hand rises slowly to the height `low` [m] at most, and then fast."""
+def run_lift(driver: TrialDriver) -> ClosureResult:
+    """Run a lift trial in a fresh scene."""
     started = time.perf_counter()
-    lift = _Lift(driver.open(), low)
+    lift = _Lift(driver.open())
     status = lift.perform()
     return lift.result(status, time.perf_counter() - started)
 
@@ -120,10 +120,8 @@ class _ObjectLost(Exception):
 class _Lift:
     """One lift trial and the record of its ticks."""
 
-    def __init__(self, run: TrialRun, low: float = 0.0) -> None:
+    def __init__(self, run: TrialRun) -> None:
         self.run, self.spec = run, run.spec
-        self.low = min(low, run.spec.lift_height)  # height [m] of a slow first rise
-        self.slow = 1.0 if low else 0.0  # its time [s]
         self.ticks: list[Tick] = []
         self.arrived, self.pushed, self.strained, self.unbalanced = 0, 0.0, False, math.nan
         self.touched: int | None = None
@@ -148,7 +146,7 @@ class _Lift:
             self.touched = self.pressed if self.touched is None else self.touched
             self.pushed, self.strained = self._moved(), run.strained()
             self.unbalanced = run.robot.unbalanced()
-            rising = run.robot.ticks(self.slow + LIFT_TIME)
+            rising = run.robot.ticks(LIFT_TIME)
             for k in range(rising + run.robot.ticks(self.spec.hold_time)):
                 if k == rising and any(self.spec.push):
                     run.scene.pull(np.array(self.spec.push))
@@ -182,14 +180,10 @@ class _Lift:
     def _height(self, time: float, rising: float) -> tuple[float, float]:
         """Return target height [m] and speed [m/s] at a time, for a rise of `rising` seconds and then shaking."""
         rate_hz = 5.0  # frequency of the shaking [Hz]
-        if time < self.slow:
-            share, rate = smooth_step(time / self.slow)
-            return self.low * share, self.low * rate / self.slow
-        way, span = self.spec.lift_height - self.low, rising - self.slow
-        share, rate = smooth_step(min((time - self.slow) / span, 1.0))
-        height = self.low + way * share
+        share, rate = smooth_step(min(time / rising, 1.0))
+        height = self.spec.lift_height * share
         if time < rising or self.spec.shake == 0.0:
-            return height, way * rate / span
+            return height, self.spec.lift_height * rate / rising
         frequency = 2 * math.pi * rate_hz
         phase = frequency * (time - rising)
         return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)

@@ -88,9 +88,9 @@ class LiftTry(NamedTuple):
 def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3) -> tuple[LiftTry, ...]:
     """Lift an object with the first grasp of a trial, and with others where a lift fails; return all tries.
 
-    With several tries the hand rises slowly at first. Where the hand feels that the object slides or stays behind
-    (`LiftCheck`), or is too heavy, the hand goes down, opens and withdraws. The object stays where it then is. The
-    robot expects it where the touches of the last try tell, or looks once more, and tries the grasp of `next_grasp`.
+    Where the hand feels that the object slides or stays behind (`LiftCheck`), or is too heavy, it goes down, opens and
+    withdraws. The object stays where it then is. The robot expects it where the touches of the last try tell, or looks
+    once more, and tries the grasp of `next_grasp`.
 
     Args:
         trial: the trial, with grasps in the order of preference; the truth's `error` is that of the first grasp.
@@ -125,7 +125,7 @@ def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry,
         truth = _left_behind(trial, result, _felt(controller), grasps.obj_from_hand[row].to("cpu", torch.float64))
         trial = dataclasses.replace(trial, grasp=grasps[row], truth=truth, seed=seed_of(trial.seed, "again"))
         tried, driver = [*tried, row], TrialDriver(trial, driver.spec)
-    last = run_lift(driver, LiftCheck.low if tries > 1 else 0.0)  # it goes on whatever the hand feels
+    last = run_lift(driver)  # it goes on whatever the hand feels
     return *done, LiftTry(tried[-1], last)
 
 
@@ -133,7 +133,7 @@ class _CheckedLift(_Lift):
     """A lift that ends where the hand feels that it has lost the object."""
 
     def __init__(self, run: TrialRun) -> None:
-        super().__init__(run, LiftCheck.low)
+        super().__init__(run)
         self.check = LiftCheck(run.robot.reference)
 
     def _gives_up(self, height: float) -> bool:
