@@ -24,7 +24,7 @@ file.write_text(format_grasps(hand, grasps[:1], force=3.0, kp=STIFFNESS))
 content = json.loads(file.read_text())  # from here on the file is enough
 best, times = content["grasps"][0], content["time"]
 postures = sorted(times, key=times.get)  # pregrasp, grasp, squeeze
-print("the arm brings the hand's root to", best["pose"], "along", best["approach"])
+print("the arm brings the hand's root to", best["pose"], "along", best["approach"], "and stays off by", best["rise"])
 
 knots = np.array([[best["joints"][posture][joint] for joint in ORDER] for posture in postures])
 seconds = np.arange(round(times["squeeze"] * RATE) + 1) / RATE

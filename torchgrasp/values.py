@@ -216,9 +216,10 @@ class IKSeeds(Batch):
 class Grasps(Batch):
     """Grasps: hand configurations with their contacts, certificates and checks, best first.
 
-    Finger i touches contact i. `pregrasp` are the joints of the opened hand at the same pose; `approach` is the unit
-    direction in which the opened hand moves straight to this pose. `clearance` [m] is the least distance of the links
-    from the estimated surface, from each other and from the table; fingertips may touch the surface. `normal_angle`
+    Finger i touches contact i. `pregrasp` are the joints of the opened hand, which is at the same pose or, where its
+    links would be in the table, above it (`ik.opened_pose`). `approach` is the unit direction in which the opened hand
+    moves straight there. `clearance` [m] is the least distance of the links from the estimated surface, from each other
+    and from the table; fingertips may touch the surface. `normal_angle`
     [rad] is the angle between pad axis and contact direction. `score` is the log-odds of the predicted success, which
     ranks the grasps. `known` tells for which grasps trials support the prediction; None means for all. `meta` holds
     names, units, hashes and the seed as text.

@@ -10,10 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.pinch import pinch
-from torchgrasp import load_hand
+from torchgrasp import Plane, load_hand
 from torchgrasp.app import cli
 from torchgrasp.control.forces import squeeze
-from torchgrasp.export import format_grasps, format_keyframes
+from torchgrasp.errors import BadArgument
+from torchgrasp.export import format_grasps, format_keyframes, format_moveit
 from torchgrasp.geometry.frames import apply
 
 HANDS = ["allegro", "barrett"]
@@ -74,6 +75,22 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
     start, arrived = (model.key(f"grasp_0_{pose}").qpos for pose in ("approach", "pregrasp"))
     np.testing.assert_array_equal(start[3:], arrived[3:])
     np.testing.assert_allclose(arrived[:3] - start[:3], 0.1 * grasp.approach[0].numpy(), atol=1e-12)
+
+
+def test_a_hand_whose_opened_fingers_are_in_the_table_stays_above_its_pose():
+    """The table is 5 mm above the lowest sphere of the opened hand: by hand, the hand rises by 6 mm."""
+    mujoco = pytest.importorskip("mujoco")
+    hand, grasp = pinch("barrett")
+    lowest = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.pregrasp))[0, :, 2] - hand.collision_spheres.radius
+    table = Plane.horizontal(float(lowest.min()) + 0.005)
+    grasp = dataclasses.replace(grasp, meta=grasp.meta | {"table": table.describe()})
+    row = json.loads(format_grasps(hand, grasp))["grasps"][0]
+    assert row["rise"] == pytest.approx([0.0, 0.0, 0.006], abs=1e-9)
+    model = mujoco.MjModel.from_xml_string(format_keyframes(hand, grasp))
+    opened, closed = (model.key(f"grasp_0_{name}").qpos[:3] for name in ("pregrasp", "grasp"))
+    np.testing.assert_allclose(opened - closed, row["rise"], atol=1e-12)
+    with pytest.raises(BadArgument, match="goes down while it closes"):
+        format_moveit(hand, grasp)
 
 
 def test_a_robot_of_half_the_stiffness_gets_twice_the_lead():

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from tests.make import distance_field, touched_contacts
-from torchgrasp import Certificate, Status, load_hand
-from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates, raise_hand
+from torchgrasp import Certificate, Plane, Status, load_hand
+from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
+from torchgrasp.ik.motion import opened_pose
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +68,7 @@ def test_an_opened_hand_rises_until_it_clears_the_table_by_a_millimetre():
     pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)).expand(3, -1, -1).clone()
     height = -hand.sphere_centres(joints)[..., 2] - hand.collision_spheres.radius
     pose[:, 2, 3] = torch.tensor([0.015, 0.025, -0.02], dtype=torch.float64) - height.amin(1)
-    raised = raise_hand(hand, Configuration(joints, pose), CollisionWorld(table=0.02)).obj_from_hand
-    moved = (raised - pose)[:, :3, 3]
+    moved = (opened_pose(hand, joints, pose, Plane.horizontal(0.02)) - pose)[:, :3, 3]
     expected = torch.tensor([[0, 0, 0.006], [0, 0, 0], [0, 0, 0]], dtype=torch.float64)
     torch.testing.assert_close(moved, expected, atol=1e-9, rtol=0)
-    assert torch.equal(raise_hand(hand, Configuration(joints, pose), CollisionWorld()).obj_from_hand, pose)
+    assert torch.equal(opened_pose(hand, joints, pose, None), pose)

@@ -13,14 +13,14 @@ from torchgrasp.base import Value
 from torchgrasp.checks import ANY, Force, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closure import ClosingGains, SensorModel
 from torchgrasp.control import forces, law
-from torchgrasp.control.tactile import STILL, Observation
+from torchgrasp.control.tactile import Observation
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.hand.collision_shapes import rise_of
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.motion import opened_pose
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps
 
@@ -166,11 +166,8 @@ class ClosingReference(Value):
     @functools.cached_property
     def rise(self) -> Float[Tensor, "3"]:
         """How far [m] the opened hand is above its planned pose before it closes, so that no link is in the table."""
-        if self.table is None:
-            return STILL
-        spheres = self.hand.collision_spheres
-        height = self.table.height(self.hand.sphere_centres(self.pregrasp))
-        return rise_of(height, spheres.radius.double()) * self.table.normal
+        planned = torch.eye(4, dtype=torch.float64)[None]
+        return opened_pose(self.hand, self.pregrasp[None], planned, self.table)[0, :3, 3]
 
     @functools.cached_property
     def _actuated(self) -> list[int]:

@@ -21,6 +21,7 @@ from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import format_json, write_file
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.motion import opened_pose
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values import Grasps
 
@@ -68,12 +69,14 @@ def save_dexgraspbench(
         raise BadArgument("hand", repr(hand.name), known)
     _, postures = named_postures(hand, grasps, force, kp)
     paths = list[Path]()
-    for row, obj_from_root in enumerate(grasps.obj_from_hand.double().cpu()):
-        obj_from_bench = obj_from_root @ bench_from_root.mT
-        place = [*obj_from_bench[:3, 3].tolist(), *quaternion(obj_from_bench)]
+    closed = grasps.obj_from_hand.double().cpu()
+    opened = opened_pose(hand.to("cpu"), grasps.pregrasp.cpu(), closed, grasps.table)
+    for row in range(len(grasps)):
         content: dict[str, Any] = {"obj_path": object_path, "obj_scale": 1.0}
         content["obj_pose"] = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         for name, joints in postures.items():
+            obj_from_bench = (opened if name == "pregrasp" else closed)[row] @ bench_from_root.mT
+            place = [*obj_from_bench[:3, 3].tolist(), *quaternion(obj_from_bench)]
             content[f"{name}_qpos"] = np.array([*place, *(float(joints[joint][row]) for joint in order)])
         paths.append(write_file(Path(folder) / f"{row}.npy", lambda file, x=content: np.save(file, np.array(x))))
     return paths

@@ -14,7 +14,7 @@ from torchgrasp.files import format_json
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.motion import APPROACH_DISTANCE
+from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
 from torchgrasp.sim.mujoco_scene import add_drive, add_links, format_numbers
 from torchgrasp.values import Grasps
 
@@ -25,7 +25,8 @@ CONVENTIONS = {
         "hand": "the root link of the hand's URDF",
     },
     "pose": "position p and unit quaternion (w, x, y, z) of the hand in the object's frame: x_object = R x_hand + p",
-    "approach": "unit direction in the object's frame in which the hand comes to its pose, opened, by the distance",
+    "approach": "unit direction in the object's frame in which the opened hand comes to its pose, by the distance",
+    "rise": "displacement of the hand from its pose until it closes, so that opened fingers are not in the table",
     "joints": "by the names of the hand's URDF, all that move: actuated, coupled and parked",
     "squeeze": "targets of position-controlled joints: stiffness (squeeze - grasp) = torque = J^T force",
     "force": "of the fingertip on the object at its contact, in the object's frame",
@@ -37,9 +38,10 @@ CONVENTIONS = {
 def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
     """Return grasps as JSON, together with `CONVENTIONS`, which explain the numbers.
 
-    The hand moves along "approach" to "pose" in its "pregrasp" posture. It closes to "grasp" in the given time, and in
-    the same time again it presses towards "squeeze". All joints move evenly. The strongest finger presses with a normal
-    force of `force` [N]. `kp` is the stiffness of the robot's position control [N m/rad], by default the hand's.
+    The hand moves along "approach" to "pose" and its "rise", in its "pregrasp" posture. It closes to "grasp" in the
+    given time, and in the same time again it presses towards "squeeze". All joints move evenly. The strongest finger
+    presses with a normal force of `force` [N]. `kp` is the stiffness of the robot's position control [N m/rad], by
+    default the hand's.
 
     Raises:
         BadArgument: joints of another hand, or a force or stiffness that is not positive.
@@ -53,6 +55,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     """
     grasps, path = grasps.to("cpu"), hand.urdf_path
     squeezed, postures = named_postures(hand, grasps, force, kp)
+    opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     forces, std = rotate(grasps.obj_from_hand.double(), squeezed.forces), grasps.contacts.std_m
     rows = [
         {
@@ -61,6 +64,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
             "success": float(grasps.success[row]),
             "pose": {"position": pose[:3, 3].tolist(), "quaternion_wxyz": quaternion(pose)},
             "approach": {"direction": grasps.approach[row].tolist(), "distance": APPROACH_DISTANCE},
+            "rise": (opened[row] - pose)[:3, 3].tolist(),
             "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in postures.items()},
             "torque": dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True)),
             "contacts": [
@@ -82,7 +86,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     ]
     content = {
         "format": "torchgrasp grasps",
-        "version": 2,  # version 1 had no approach
+        "version": 3,  # version 1 had no approach, version 2 no rise
         **CONVENTIONS,
         "hand": {"name": hand.name, "urdf": path.name, "root": read_urdf(path).root, "sha256": hand.source.sha256},
         "actuated": list(hand.joint_names),
@@ -152,8 +156,10 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positiv
         ("grasp", 0.0, "grasp", "grasp"),
         ("squeeze", 0.0, "grasp", "squeeze"),
     )
-    for row, pose in enumerate(grasps.obj_from_hand):
+    opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    for row, closed in enumerate(grasps.obj_from_hand):
         for name, distance, state, targets in keys:
+            pose = opened[row] if state == "pregrasp" else closed
             position = pose[:3, 3] - distance * grasps.approach[row]
             joints, control = ([float(postures[x][joint][row]) for joint in order] for x in (state, targets))
             qpos = format_numbers([*position.tolist(), *quaternion(pose), *joints])

@@ -4,16 +4,18 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import torch
 import yaml
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import Force, Positive, checked
 from torchgrasp.control.paper.closings import POSE_TIME
+from torchgrasp.errors import BadArgument
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.motion import APPROACH_DISTANCE
+from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
 from torchgrasp.values import Grasps
 
 OBJECT_FRAME = "object"
@@ -46,7 +48,8 @@ def format_moveit(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     m/rad], by default the hand's.
 
     Raises:
-        BadArgument: joints of another hand, or a force or stiffness that is not positive.
+        BadArgument: joints of another hand, or a force or stiffness that is not positive; a grasp whose hand goes down
+            while it closes (`opened_pose`), which a message with one pose cannot tell.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -54,6 +57,8 @@ def format_moveit(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     >>> print(text.splitlines()[2])
     # the hand's frame is link 'palm' of hand.urdf; joints in the order of joint_names
     """
+    if not torch.equal(opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table), grasps.obj_from_hand):
+        raise BadArgument("grasps", "a hand that goes down while it closes", "hands that close at one pose")
     messages = [
         {
             "id": f"grasp_{row}",

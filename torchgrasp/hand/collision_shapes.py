@@ -47,13 +47,6 @@ class CollisionSpheres(Value):
     touching: Bool[Tensor, " s"]
 
 
-def rise_of(height: Float[Tensor, "*b s"], radius: Float[Tensor, " s"]) -> Float[Tensor, "*b"]:
-    """Return how far [m] spheres at a `height` over a table must rise to clear it; 0 if it is more than 30 mm."""
-    gap, most = 0.001, 0.03  # [m]: what rises clears the table by the gap
-    lowest = (height - radius).amin(-1)
-    return torch.where((lowest < 0) & (gap - lowest <= most), gap - lowest, 0.0)
-
-
 def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
     """Return spheres that cover every collision shape of a URDF."""
     bulge = 0.004  # how far a sphere may stand out of a shape's faces [m], other than a fingertip's

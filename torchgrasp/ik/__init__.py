@@ -9,11 +9,12 @@ collisions are checked (`candidates`). Four solvers share these steps: `solve_ik
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.joint import solve_joint
+from torchgrasp.ik.motion import opened_pose
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
 from torchgrasp.ik.solve import IKSolution, solve_ik
 from torchgrasp.values import IKSeeds
 
 __all__ = [
     "CollisionWorld", "GraspProblem", "IKSeeds", "IKSolution", "Obstacles", "PostureLibrary", "nearest_postures",
-    "solve_ik", "solve_joint",
+    "opened_pose", "solve_ik", "solve_joint",
 ]  # fmt: skip

@@ -13,11 +13,10 @@ from torchgrasp.base import Batch, Value
 from torchgrasp.checks import ANY, Length, Rows, checked, show
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import rotate
-from torchgrasp.hand.collision_shapes import rise_of
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along, link_clearance
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.ik.motion import find_approach, motion_clearance
+from torchgrasp.ik.motion import find_approach, motion_clearance, opened_pose
 from torchgrasp.ik.ranking import score
 from torchgrasp.ik.refine import open_hand, tip_targets
 from torchgrasp.plan.feasibility import first_violation
@@ -150,16 +149,6 @@ def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) ->
     return (links >= 0) & (table >= 0) & (hand.self_clearance(configuration.joints) >= 0)
 
 
-def raise_hand(hand: Hand, opened: Configuration, world: CollisionWorld) -> Configuration:
-    """Return opened hands, raised where links would be in the table: coupled fingers that open may go down, too."""
-    if world.plane is None:
-        return opened
-    height = along(SpatialJacobian.at(hand, opened).sphere_centres, world.plane) - world.plane.offset
-    pose = opened.obj_from_hand.clone()
-    pose[:, :3, 3] += rise_of(height, hand.collision_spheres.radius.to(height))[:, None] * world.plane.normal.to(pose)
-    return dataclasses.replace(opened, obj_from_hand=pose)
-
-
 @checked
 def check_candidates(
     problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
@@ -173,7 +162,7 @@ def check_candidates(
 
     pregrasp, touching = configuration.joints.clone(), (planned == Status.OK) & (errors.status == Status.OK)
     pregrasp[touching] = open_hand(hand, configuration[touching], contacts[touching], world)
-    opened = raise_hand(hand, Configuration(pregrasp, configuration.obj_from_hand), world)
+    opened = Configuration(pregrasp, opened_pose(hand, pregrasp, configuration.obj_from_hand, world.plane))
     blocked = (errors.status == Status.OK) & ~is_clear(hand, opened, world)
     status = torch.where(blocked, int(Status.PREGRASP), errors.status)
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import checked
-from torchgrasp.geometry.frames import rotate
+from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
@@ -41,6 +41,31 @@ def find_approach(
         better = exact > clearance[touching]
         chosen[touching[better]], clearance[touching[better]] = direction[better], exact[better]
     return chosen, clearance
+
+
+@checked
+def opened_pose(
+    hand: Hand, joints: Float[Tensor, "g h"], obj_from_hand: Float[Tensor, "g 4 4"], table: Plane | None
+) -> Float[Tensor, "g 4 4"]:
+    """Return the pose in which an opened hand comes to its grasp: raised where links would be in the table.
+
+    Coupled fingers that open may go down, too. A hand that would have to rise by more than 30 mm stays in the table.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> torch.equal(opened_pose(hand, grasp.pregrasp, grasp.obj_from_hand, grasp.table), grasp.obj_from_hand)
+    True
+    """
+    if table is None:
+        return obj_from_hand
+    gap, most = 0.001, 0.03  # [m]: what rises clears the table by the gap
+    centres = apply(obj_from_hand, hand.sphere_centres(joints))
+    lowest = (along(centres, table) - table.offset - hand.collision_spheres.radius.to(centres)).amin(1)
+    rise = torch.where((lowest < 0) & (gap - lowest <= most), gap - lowest, 0.0)
+    pose = obj_from_hand.clone()
+    pose[:, :3, 3] += rise[:, None] * table.normal.to(pose)
+    return pose
 
 
 def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) -> Float[Tensor, "g k 3"]:

@@ -25,7 +25,7 @@ from torchgrasp.closure import ClosureResult
 from torchgrasp.control.forces import squeeze
 from torchgrasp.files import write_file
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.motion import APPROACH_DISTANCE
+from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
 from torchgrasp.values import Grasps
 
 VIEW = "view.html"  # name of the page beside the report
@@ -147,10 +147,11 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
     """Return the table rows of grasps, their contacts, and all link poses in each of the `POSTURES`."""
     columns = (0, 1, 5, 3, 6)  # rank, success, margin, clearance and standard deviation
     pose, opened = grasps.obj_from_hand.double(), grasps.pregrasp.double()
-    away = pose.clone()
+    raised = opened_pose(hand, opened, pose, grasps.table)
+    away = raised.clone()
     away[:, :3, 3] -= APPROACH_DISTANCE * grasps.approach.double()
     squeezed = squeeze(hand, grasps).joints if len(grasps) else opened
-    motion = [(opened, away), (opened, pose), (grasps.joints.double(), pose), (squeezed, pose)]
+    motion = [(opened, away), (opened, raised), (grasps.joints.double(), pose), (squeezed, pose)]
     poses = [link_poses(hand, hand.expand_joints(q), hand.tree.joint_names, p) for q, p in motion]
     return {
         "heads": [GRASP_COLUMNS[k] for k in columns],
