@@ -47,14 +47,6 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(tests)
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Give each process a run of neighbouring tests, which share fixtures, until one has none left."""
-    from xdist.scheduler import WorkStealingScheduling
-
-    return WorkStealingScheduling(config, log) if config.getoption("dist") == "load" else None
-
-
 def jaxtyped(thing: Any = None, **options: Any) -> Any:
     """Check the annotations of functions as jaxtyping does, which takes most of a test's time to bind arguments."""
     if "typechecker" not in options or inspect.isgeneratorfunction(thing):

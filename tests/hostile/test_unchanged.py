@@ -36,10 +36,8 @@ def sweep(folder: Path) -> None:
     for name, (make, annotated) in sorted(checked_things().items()):
         call, hints = make(), hints_of(annotated)
         good = required(annotated, call, folder)
-        one: dict[str, Any] = {
-            key: 1 for key, hint in hints.items() if hint == Count
-        }  # one start, one row: little work
-        one |= {key: QUICK for key, hint in hints.items() if hint == TrialSpec | None}
+        least = {Count: 1, TrialSpec | None: QUICK}  # one start, one row, a short trial: little work
+        one: dict[str, Any] = {key: least[hint] for key, hint in hints.items() if hint in least}
         wrong = list(wrong_arguments(annotated, call))  # beartype draws which items it looks at
         value = getattr(call, "__self__", None)
         kept = [value if isinstance(value, Value) else None, good, [x for _, x in wrong]]
