@@ -82,11 +82,9 @@ def camera_support(seen: PreparedCloud, completion: Completion | None, noise: fl
     center, kind, parts, free, inside = frame.center, "whole", (), None, True
     if completion is not None:
         parts, kind = _observe_completion(completion, frame), completion.kind
-        reach = float(torch.linalg.vector_norm(frame.normalise(surface), dim=-1).max())
-        free = free_space(completion.outline, frame, table, reach)
-        # Not so for an arch or a bowl, nor for a ring whose front hides its middle: there the outline is close.
-        beside, away = completion.outline.hull_distance(center.cpu()), torch.cdist(center[None], surface).amin()
-        inside = float(completion.outline.violation(center.cpu())) == 0.0 and float(beside) < -0.5 * float(away)
+        reach = torch.linalg.vector_norm(frame.normalise(surface), dim=-1).max() if completion.frame else 1.0
+        free = free_space(completion.outline, frame, table, float(reach))
+        inside = not completion.frame and float(completion.outline.violation(center.cpu())) == 0.0  # an arch, a bowl
     sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
     x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
     distance = torch.cdist(x, frame.normalise(surface)).amin(1)

@@ -1,4 +1,4 @@
-"""Completion of the hidden side by mirror images of the visible side, and of thin bars by their width."""
+"""Completion of the hidden side by mirror images of the visible side, and of the bars of a frame by their width."""
 
 import dataclasses
 import math
@@ -58,6 +58,7 @@ class Completion(Value):
     scores: Float[Tensor, "p"]  # of the planes: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it
     outline: Outlines
     kind: Kind  # how the hidden side was completed, which selects the calibration
+    frame: bool = False  # whether the object is a frame of bars round an empty middle (`is_frame`)
 
     @checked
     def moved(self, b_from_a: Pose) -> "Completion":
@@ -125,11 +126,13 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
         return hidden & ~((scorer.table.height(image.points) < 0.004) & (image.normals @ scorer.table.normal < -0.7))
 
     merged = merge_hidden(_Image.of(scorer, none, none, len(planes)), images, allowed, _thin)
-    merged = merge_hidden(merged, [_back_of_bars(scorer, len(planes))], lambda image: allowed(image, 0.0), _thin)
+    frame = is_frame(scorer)
+    if frame:
+        merged = merge_hidden(merged, [_back_of_bars(scorer, len(planes))], lambda image: allowed(image, 0.0), _thin)
     chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
     shared, asymmetry = chosen.shared.flatten(1), chosen.variance.sqrt()
     kind: Kind = "guess" if not len(planes) else "mirrored" if round_body is None else "revolution"
-    found = Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline, kind)
+    found = Completion(chosen.points, chosen.normals, shared, asymmetry, planes, scores, scorer.outline, kind, frame)
     return found if axis is None else found.moved(inverse(axis[0]))
 
 
@@ -206,6 +209,13 @@ def _mirror_in(scorer: SymmetryScorer, number: int, plane: Mirror, score: float)
         return _Image(points, normals, score if math.isinf(of.score) else min(of.score, score) - 0.05, variance, shared)
 
     return mirror
+
+
+def is_frame(scorer: SymmetryScorer) -> bool:
+    """Tell whether the middle of the cloud is empty: outside the outline or close to it, and over `THIN` from it."""
+    middle = (scorer.points.amin(0) + scorer.points.amax(0)) / 2
+    away = float(torch.cdist(middle[None], scorer.points).amin())
+    return away > THIN and float(scorer.outline.hull_distance(middle)) > -0.5 * away
 
 
 def _back_of_bars(scorer: SymmetryScorer, n_planes: int) -> _Image:
