@@ -11,7 +11,7 @@ from torchgrasp.base import count_status, join
 from torchgrasp.errors import Status
 from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_as_paper, solve_contact_first
 from torchgrasp.ik.joint import solve_sliding, try_best_seeds
-from torchgrasp.ik.motion import collision_probability
+from torchgrasp.ik.motion import collision_probability, opened_pose
 from torchgrasp.ik.ranking import (
     by_success,
     is_known,
@@ -188,7 +188,11 @@ def rank(problem: Problem, solved: Grasps) -> Grasps:
         free = 1 - collision_probability(hand, good, problem.obstacles).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
     known = torch.ones_like(solved.status, dtype=torch.bool)
-    known[solved.status == Status.OK] = is_known(problem.shape, good, problem.spec.friction) & (not problem.vague)
+    opened = opened_pose(hand, good.pregrasp, good.obj_from_hand, problem.spec.plane)
+    still = (opened == good.obj_from_hand).all(-1).all(-1)  # no trial of the model's had a hand that goes down
+    known[solved.status == Status.OK] = (
+        is_known(problem.shape, good, problem.spec.friction) & still & (not problem.vague)
+    )
     ranked = rank_by_success(dataclasses.replace(solved, known=known), log_odds)
     return ranked if request.order == "success" else rank_by_variance(ranked)
 
