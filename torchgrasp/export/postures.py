@@ -55,7 +55,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     """
     grasps, path = grasps.to("cpu"), hand.urdf_path
     squeezed, postures = named_postures(hand, grasps, force, kp)
-    opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    opened = opened_pose(hand.to("cpu"), grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     forces, std = rotate(grasps.obj_from_hand.double(), squeezed.forces), grasps.contacts.std_m
     rows = [
         {
@@ -156,7 +156,7 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positiv
         ("grasp", 0.0, "grasp", "grasp"),
         ("squeeze", 0.0, "grasp", "squeeze"),
     )
-    opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    opened = opened_pose(hand.to("cpu"), grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     for row, closed in enumerate(grasps.obj_from_hand):
         for name, distance, state, targets in keys:
             pose = opened[row] if state == "pregrasp" else closed

@@ -57,6 +57,7 @@ def format_moveit(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     >>> print(text.splitlines()[2])
     # the hand's frame is link 'palm' of hand.urdf; joints in the order of joint_names
     """
+    hand, grasps = hand.to("cpu"), grasps.to("cpu")
     if not torch.equal(opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table), grasps.obj_from_hand):
         raise BadArgument("grasps", "a hand that goes down while it closes", "hands that close at one pose")
     messages = [

@@ -36,7 +36,8 @@ class GraspProblem(Value):
     """The input of a grasp solver: a hand, contact sets with certificates of force closure, and the collision world.
 
     Grasps near `center`, the object's centre [m], score higher. The function `reachable` tells which hand poses an arm
-    can reach; without this function, every pose counts as reachable.
+    can reach; without this function, every pose counts as reachable. A hand that `descends` may begin above its pose
+    where its opened links would be in the table (`opened_pose`).
 
     Raises:
         BadArgument: the contacts lack `std_m`, the surface's standard deviation, by which the pre-grasp opens.
@@ -55,6 +56,7 @@ class GraspProblem(Value):
     world: CollisionWorld
     center: Float[Tensor, "3"]
     reachable: Reachable | None = None
+    descends: bool = False
 
     def __post_init__(self) -> None:
         self.contacts.require_std()
@@ -162,7 +164,10 @@ def check_candidates(
 
     pregrasp, touching = configuration.joints.clone(), (planned == Status.OK) & (errors.status == Status.OK)
     pregrasp[touching] = open_hand(hand, configuration[touching], contacts[touching], world)
-    opened = Configuration(pregrasp, opened_pose(hand, pregrasp, configuration.obj_from_hand, world.plane))
+    opened = Configuration(pregrasp, configuration.obj_from_hand)
+    if problem.descends:
+        raised = opened_pose(hand, pregrasp, opened.obj_from_hand, world.plane)
+        opened = dataclasses.replace(opened, obj_from_hand=raised)
     blocked = (errors.status == Status.OK) & ~is_clear(hand, opened, world)
     status = torch.where(blocked, int(Status.PREGRASP), errors.status)
 

@@ -11,7 +11,7 @@ from torchgrasp.base import count_status, join
 from torchgrasp.errors import Status
 from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_as_paper, solve_contact_first
 from torchgrasp.ik.joint import solve_sliding, try_best_seeds
-from torchgrasp.ik.motion import collision_probability, opened_pose
+from torchgrasp.ik.motion import collision_probability
 from torchgrasp.ik.ranking import (
     by_success,
     is_known,
@@ -62,6 +62,7 @@ def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
     """Yield the grasps of each batch, as `Planner.run`; if none is likely to hold, plan with relaxed constraints, too.
 
     A contact set must be flat within the largest of `FLAT_RADII` that the object allows, which can leave few contacts.
+    Then the hand may begin above its pose, too, and go down while it closes (`opened_pose`).
     The failed grasps are those of the last constraints (`ContactSpec.relaxed`).
     """
     failed, given, best = list[Grasps](), problem.given_spec, 0.0
@@ -69,7 +70,7 @@ def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
     for spec in (given, *relaxed):
         failed.clear()
         if spec is not given:
-            problem = problem.replace("flat", given_spec=spec)  # nothing else depends on what is relaxed
+            problem = problem.replace("flat", given_spec=spec, descends=True)  # nothing else depends on these
         for grasps in Planner(problem).run(deadline):
             good = grasps[executable(grasps)]
             failed.append(grasps)
@@ -188,11 +189,7 @@ def rank(problem: Problem, solved: Grasps) -> Grasps:
         free = 1 - collision_probability(hand, good, problem.obstacles).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
     known = torch.ones_like(solved.status, dtype=torch.bool)
-    opened = opened_pose(hand, good.pregrasp, good.obj_from_hand, problem.spec.plane)
-    still = (opened == good.obj_from_hand).all(-1).all(-1)  # no trial of the model's had a hand that goes down
-    known[solved.status == Status.OK] = (
-        is_known(problem.shape, good, problem.spec.friction) & still & (not problem.vague)
-    )
+    known[solved.status == Status.OK] = is_known(problem.shape, good, problem.spec.friction) & (not problem.vague)
     ranked = rank_by_success(dataclasses.replace(solved, known=known), log_odds)
     return ranked if request.order == "success" else rank_by_variance(ranked)
 

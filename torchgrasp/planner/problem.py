@@ -132,6 +132,7 @@ class Problem:
 
     The upright frame has the table's normal as z axis. `request`, the object's `cloud` and `given_spec` are in the
     caller's frame, all other fields in the upright frame. Derived values are computed when first used.
+    `descends` allows hands that go down while they close.
     """
 
     request: Request
@@ -143,6 +144,7 @@ class Problem:
     scene: Scene | None
     mixture: GraspMixture | None
     mixture_sha256: str
+    descends: bool = False
 
     @classmethod
     def of(cls, request: Request, hand: Hand) -> "Problem":
@@ -247,7 +249,7 @@ class Problem:
 
     def reach(self, contacts: Contacts, certificate: Certificate) -> GraspProblem:
         """Return the inverse kinematics problem of reaching contacts, with their certificate of force closure."""
-        return GraspProblem(self.hand, contacts, certificate, self.world, self.center, self.reachable)
+        return GraspProblem(self.hand, contacts, certificate, self.world, self.center, self.reachable, self.descends)
 
     def tell(self, stage: str, message: str, value: Any) -> None:
         """Report a stage to the observer, with the result of the stage in the caller's frame."""
