@@ -27,24 +27,6 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of many processes would 
 sys.dont_write_bytecode = False
 
 by_jaxtyping = jaxtyping.jaxtyped
-EACH = 20
-"""Of the calls of a function in a test the first so many are checked, and then one of so many, as checks take time."""
-
-
-class Tests:
-    """A plugin that counts the tests, among them examples of docstrings."""
-
-    count = 0
-
-    def pytest_runtest_setup(self) -> None:
-        self.count += 1
-
-
-tests = Tests()
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    config.pluginmanager.register(tests)
 
 
 def jaxtyped(thing: Any = None, **options: Any) -> Any:
@@ -62,14 +44,8 @@ def jaxtyped(thing: Any = None, **options: Any) -> Any:
     checked = beartype(conf=BeartypeConf(violation_type=TypeError))(thing)
     thing.__annotations__ = written
 
-    test, number = 0, 0
-
     @functools.wraps(thing)
     def call(*args: Any, **kwargs: Any) -> Any:
-        nonlocal test, number
-        test, number = tests.count, 1 + number if test == tests.count else 1
-        if number > EACH and number % EACH:
-            return thing(*args, **kwargs)
         push_shape_memo({})
         try:
             return checked(*args, **kwargs)

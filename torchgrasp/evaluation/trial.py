@@ -108,7 +108,7 @@ class TrialDriver:
 
     def _scene_spec(self, hand: Hand, grasp: Grasps) -> SceneSpec:
         """Return the parameters of the simulated scene; the hand's true pose in it includes the trial's pose error."""
-        spec, truth, drives = self.spec, self.trial.truth, hand.actuators
+        spec, truth, drives, rise = self.spec, self.trial.truth, hand.actuators, self.reference.rise
         body = self._body(truth.mesh, truth.parts)
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
@@ -123,8 +123,7 @@ class TrialDriver:
             height=None if truth.table is None else 0.0,
             neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in truth.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
-            yields=spec.components.palm_reach + (0.0 if truth.camera is None else 1.5 * REACH)
-            + float(self.reference.rise.norm()),
+            yields=spec.components.palm_reach + 1.5 * REACH * (truth.camera is not None) + float(rise.norm()),
         )  # fmt: skip
 
     def _body(self, given: "Solid", parts: "Sequence[trimesh.Trimesh] | None", mass: float | None = None) -> Body:

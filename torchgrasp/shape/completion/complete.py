@@ -58,7 +58,7 @@ class Completion(Value):
     scores: Float[Tensor, "p"]  # of the planes: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it
     outline: Outlines
     kind: Kind  # how the hidden side was completed, which selects the calibration
-    frame: bool = False  # whether the object is a frame of bars round an empty middle (`is_frame`)
+    frame: bool = False  # whether the object is a frame of bars round an empty middle
 
     @checked
     def moved(self, b_from_a: Pose) -> "Completion":
@@ -126,7 +126,7 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
         return hidden & ~((scorer.table.height(image.points) < 0.004) & (image.normals @ scorer.table.normal < -0.7))
 
     merged = merge_hidden(_Image.of(scorer, none, none, len(planes)), images, allowed, _thin)
-    frame = is_frame(scorer)
+    frame = _is_frame(scorer)
     if frame:
         merged = merge_hidden(merged, [_back_of_bars(scorer, len(planes))], lambda image: allowed(image, 0.0), _thin)
     chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
@@ -211,7 +211,7 @@ def _mirror_in(scorer: SymmetryScorer, number: int, plane: Mirror, score: float)
     return mirror
 
 
-def is_frame(scorer: SymmetryScorer) -> bool:
+def _is_frame(scorer: SymmetryScorer) -> bool:
     """Tell whether the middle of the cloud is empty: outside the outline or close to it, and over `THIN` from it."""
     middle = (scorer.points.amin(0) + scorer.points.amax(0)) / 2
     away = float(torch.cdist(middle[None], scorer.points).amin())
