@@ -1,24 +1,18 @@
 """Generators, analytic shapes and small hands that several tests share."""
 
-import dataclasses
-import functools
-import inspect
 import math
 import os
 import re
 import sys
-import typing
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import jaxtyping
 import pytest
 import torch
-from beartype import BeartypeConf, beartype
 from hypothesis import HealthCheck, settings
-from jaxtyping._storage import pop_shape_memo, push_shape_memo
 from torch import Tensor
+
+from tests import annotations
 
 if TYPE_CHECKING:
     from torchgrasp.values import PointCloud
@@ -26,44 +20,7 @@ if TYPE_CHECKING:
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of many processes would compile the library and the tests anew
 sys.dont_write_bytecode = False
 
-by_jaxtyping = jaxtyping.jaxtyped
-
-
-def jaxtyped(thing: Any = None, **options: Any) -> Any:
-    """Check the annotations of functions as jaxtyping does, which takes most of a test's time to bind arguments."""
-    if "typechecker" not in options or inspect.isgeneratorfunction(thing):
-        return by_jaxtyping(thing, **options)
-    if thing is None:
-        return functools.partial(jaxtyped, **options)
-    if isinstance(thing, type):
-        if dataclasses.is_dataclass(thing) and getattr(thing.__init__, "__globals__", None) is not globals():
-            setattr(thing, "__init__", jaxtyped(thing.__init__, **options))  # noqa: B010
-        return thing
-    written = thing.__annotations__
-    thing.__annotations__ = {name: resolved(hint, thing.__globals__) for name, hint in written.items()}
-    checked = beartype(conf=BeartypeConf(violation_type=TypeError))(thing)
-    thing.__annotations__ = written
-
-    @functools.wraps(thing)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        push_shape_memo({})
-        try:
-            return checked(*args, **kwargs)
-        finally:
-            pop_shape_memo()
-
-    return call
-
-
-def resolved(hint: Any, names: dict[str, Any]) -> Any:
-    """Return an annotation without texts; `Any` where a text names what is not defined yet."""
-    try:
-        return typing.get_type_hints(SimpleNamespace(__annotations__={"it": hint}), names, include_extras=True)["it"]
-    except NameError:
-        return Any
-
-
-jaxtyping.jaxtyped = jaxtyped  # before the first module of the library is imported
+annotations.install()
 
 SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 settings.register_profile("short", max_examples=100, derandomize=True, deadline=None, suppress_health_check=SLOW)
