@@ -15,6 +15,7 @@ from benchmarks.common import Options, Row, bench
 from torchgrasp.app.report.evaluation import list_causes
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, PoseNoise, Protocol, ViewScore, evaluate, summarise
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
+from torchgrasp.evaluation.protocols import draw_slide, seed_of
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 
@@ -33,6 +34,9 @@ BARS: dict[str, tuple[dict[str, Any], float, float]] = {
 
 HANDS = {"barrett": 0.92, "leap": 0.95, "shadow": 0.95}
 """Bars of other hands for the share risen in place; none was set for the share held without slip."""
+
+DISTANCES = {(0, 15): None, (15, 30): None, (30, 45): None, (45, 60): 0.75, (60, 75): None}
+"""Distances [mm] by which results of moved objects are told, and the project's bar for the share that rose."""
 
 SIMULATORS = "both simulators"
 """The condition that lifts in place with both simulators; `--grasps` gives the number of grasps of each view."""
@@ -55,9 +59,12 @@ def table_lift(o: Options) -> list[Row]:
             changes, least, strict = BARS[name]
             if name == "in place" and hand.name in HANDS:
                 least, strict = HANDS[hand.name], 0.0
-            scores = lift(dataclasses.replace(BASE, **changes), o.simulator, 1)
-            rows.append(_row(f"{hand.name}, {name}", scores, least, strict))
-            print(rows[-1], flush=True)
+            protocol = dataclasses.replace(BASE, **changes)
+            scores = lift(protocol, o.simulator, 1)
+            what = f"{hand.name}, {name}"
+            found = [_row(what, scores, least, strict), *_by_distance(what, scores, protocol.noise, o.seed)]
+            print(*found, sep="\n", flush=True)
+            rows += found
     return rows
 
 
@@ -89,6 +96,22 @@ def _row(what: str, scores: Sequence[ViewScore], least: float, strict: float) ->
     lost = [(x.object, a.draw, a.status.name, a.cause, a.size) for x in scores for a in x.attempts if not a.held]
     numbers = {"risen": risen["top1"], "held": held["top1"], "causes": risen["causes"], "not held": lost}
     return Row(what, bar, "; ".join(words), met, numbers)
+
+
+def _by_distance(what: str, scores: Sequence[ViewScore], noise: PoseNoise, seed: int) -> Iterator[Row]:
+    """Yield the share that rose of the objects that were moved by a distance, for each bin of distances."""
+    if not noise.translation:
+        return
+    tried = [(score, x) for score in scores for x in score.attempts]
+    slides = [draw_slide(noise, seed_of(seed, score.object, score.view, x.rank, x.draw)) for score, x in tried]
+    moved = [1e3 * float(slide.norm()) for slide in slides]
+    for (low, high), least in DISTANCES.items():
+        mine = [at for at, distance in zip(tried, moved, strict=True) if low <= distance < high]
+        if mine:
+            share = share_over(count_by((score.unit, x.passed) for score, x in mine))
+            met = None if least is None else share.value >= least
+            bar = "" if least is None else f">= {least:.0%}"
+            yield Row(f"{what}, {low} to {high} mm", bar, format_share(share), met, {"share": share})
 
 
 def _strict(score: ViewScore) -> ViewScore:
