@@ -117,8 +117,8 @@ def test_words_about_a_cloud_are_the_same(device):
 def test_obstacles_are_asked_where_they_are(device, hand, shape, grasps):
     obstacles = Obstacles.of(estimate_occupancy(load_scene(), 1))
     vertices = extract_surface(shape, 24).vertices
-    found = collision_probability(sent(hand), sent(grasps), sent(obstacles))
-    same(found, collision_probability(hand, grasps, obstacles))
+    found = collision_probability(sent(hand), sent(grasps), sent(obstacles), SPEC.plane)
+    same(found, collision_probability(hand, grasps, obstacles, SPEC.plane))
     assert lift_clearance(sent(vertices), sent(obstacles)) == lift_clearance(vertices, obstacles)
     same(spread_rows(plan_contacts(sent(shape), SPEC, 6), 3), spread_rows(plan_contacts(shape, SPEC, 6), 3))
 

@@ -10,6 +10,7 @@ import torch
 from tests.make import near, real
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.ik import Obstacles
 from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.scene import Occupancy
@@ -46,15 +47,16 @@ def executable(grasps):
     return grasps[grasps.status == Status.OK]
 
 
-def paths(hand, grasp):
+def paths(hand, grasp, rise=0.0):
     """Sphere centres (n, 3) and radii on a grasp's approach, closing and lift, by forward kinematics."""
-    opened = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.pregrasp))[0]
+    opened = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.pregrasp))[0] + real([0.0, 0.0, rise])
     closed = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.joints))[0]
     up = real([0.0, 0.0, 1.0])
     places = [opened - back * grasp.approach[0] for back in torch.linspace(0.1, 0, 30).tolist()]
     for share in np.linspace(0, 1, 9):
         joints = grasp.pregrasp + share * (grasp.joints - grasp.pregrasp)
-        places.append(apply(grasp.obj_from_hand, hand.sphere_centres(joints))[0])
+        down = real([0.0, 0.0, (1 - share) * rise])
+        places.append(apply(grasp.obj_from_hand, hand.sphere_centres(joints))[0] + down)
     places += [closed + height * up for height in torch.linspace(0, 0.1, 30).tolist()]
     return torch.stack(places), hand.collision_spheres.radius.double()
 
@@ -97,7 +99,7 @@ def test_the_field_is_the_distance_to_the_region_and_tells_the_room_for_a_lift(g
 
 def test_probability_of_collision_is_that_of_what_is_swept(hand, free):
     likely, unlikely, none = (
-        collision_probability(hand, free, Obstacles.of(ball_occupancy(likely=p))) for p in (0.95, 0.3, 0.11)
+        collision_probability(hand, free, Obstacles.of(ball_occupancy(likely=p)), None) for p in (0.95, 0.3, 0.11)
     )
     gaps = [(centres - BALL).norm(dim=-1) - radius - SIZE for centres, radius in (paths(hand, g) for g in free)]
     met, away = (
@@ -126,3 +128,18 @@ def test_only_reachable_poses_are_grasps(jug, hand, free):
     assert Status.OK not in jug.solve(reachable=lambda poses: torch.full((len(poses),), next(once, False))).status
     with pytest.raises(BadArgument, match="reachable"):
         jug.solve(reachable=lambda poses: math.inf)
+
+
+def test_a_hand_that_begins_above_its_grasp_sweeps_from_there(hand, free, generator):
+    radius = hand.collision_spheres.radius.double()
+    sides = torch.nn.functional.normalize(torch.randn(60, 3, generator=generator, dtype=torch.float64), dim=1)
+    for grasp in free[:3]:
+        grasp = dataclasses.replace(grasp, approach=real([[0.0, 0.0, 1.0]]))  # not through the place above it
+        opened = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.pregrasp))[0]
+        table = Plane.horizontal(float((opened[:, 2] - radius).min()) + 0.028)  # opened links would be in the table
+        level, above = paths(hand, grasp)[0], paths(hand, grasp, 0.029)[0][29]
+        skin = (above[:, None] + radius[:, None, None] * sides).reshape(-1, 3)
+        room = (torch.cdist(skin, level.reshape(-1, 3)) - radius.repeat(len(level))).amin(1)
+        ball = Obstacles.of(ball_occupancy(skin[room.argmax()], 0.004))  # beside the way without a rise
+        assert float(collision_probability(hand, grasp, ball, None)) == 0
+        assert float(collision_probability(hand, grasp, ball, table)) > 0.8

@@ -209,7 +209,7 @@ def _keep_clear(
     if world.guarded:
         status[pushed] = int(Status.NEIGHBOUR_COLLISION)
         ready = torch.nonzero(status == Status.OK)[:, 0]
-        room = motion_clearance(hand, configuration[ready], opened.joints[ready], world)
+        room = motion_clearance(hand, configuration[ready], opened[ready], world)
         status[ready[room < 0]] = int(Status.NEIGHBOUR_COLLISION)
     else:
         status[pushed], approach[pushed] = int(Status.OK), direction[clearance >= 0]

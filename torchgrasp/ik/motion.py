@@ -105,28 +105,28 @@ def _clearance(
 
 
 def motion_clearance(
-    hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"], world: CollisionWorld
+    hand: Hand, closed: Configuration, opened: Configuration, world: CollisionWorld
 ) -> Float[Tensor, "g"]:
     """Return the least clearance [m] of each hand from obstacles while the hand closes and is lifted."""
     assert world.obstacles is not None
     up = UP if world.plane is None else world.plane.normal
-    centres = torch.cat([_closing(hand, configuration, pregrasp), _lift(hand, configuration, up)], 1)
+    centres = torch.cat([_closing(hand, opened, closed), _lift(hand, closed, up)], 1)
     return (world.obstacles.field.query(centres)[0] - hand.collision_spheres.radius.to(centres)).flatten(1).amin(1)
 
 
 @checked
-def collision_probability(hand: Hand, grasps: Grasps, obstacles: Obstacles) -> Float[Tensor, "g"]:
+def collision_probability(hand: Hand, grasps: Grasps, obstacles: Obstacles, table: Plane | None) -> Float[Tensor, "g"]:
     """Return for each grasp the probability that the hand hits an obstacle during approach, closing and lift along z.
 
-    This is the largest occupancy probability of the voxels that the hand sweeps, because hidden voxels behind one
-    object are occupied or free together.
+    The hand comes to its opened pose above the `table`. The probability is the largest occupancy probability of the
+    voxels that the hand sweeps, because hidden voxels behind one object are occupied or free together.
     """
-    configuration = Configuration(grasps.joints, grasps.obj_from_hand)
-    opened = _centres(hand, Configuration(grasps.pregrasp, grasps.obj_from_hand))
-    back = torch.arange(1, COARSE_STEPS + 1, device="cpu").to(opened) * (APPROACH_DISTANCE / COARSE_STEPS)
-    approach = opened[:, None] - back[:, None, None] * grasps.approach[:, None, None]
-    closing, lift = _closing(hand, configuration, grasps.pregrasp), _lift(hand, configuration, UP)
-    centres = torch.cat([approach, closing, lift], 1)
+    closed = Configuration(grasps.joints, grasps.obj_from_hand)
+    raised = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, table)
+    opened = Configuration(grasps.pregrasp, raised)
+    back = torch.arange(1, COARSE_STEPS + 1, device="cpu").to(raised) * (APPROACH_DISTANCE / COARSE_STEPS)
+    approach = _centres(hand, opened)[:, None] - back[:, None, None] * grasps.approach[:, None, None]
+    centres = torch.cat([approach, _closing(hand, opened, closed), _lift(hand, closed, UP)], 1)
     radius = hand.collision_spheres.radius.to(centres).repeat(centres.shape[1])
     return obstacles.likelihood(centres.flatten(1, 2), radius)
 
@@ -137,11 +137,17 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> floa
     return float(obstacles.field.query(_lifted(vertices, UP))[0].min()) if len(vertices) else math.inf
 
 
-def _closing(hand: Hand, configuration: Configuration, pregrasp: Float[Tensor, "g h"]) -> Float[Tensor, "g k s 3"]:
-    """Return the centres [m] of the collision spheres at k postures, in equal steps from pre-grasp to grasp."""
+def _closing(hand: Hand, opened: Configuration, closed: Configuration) -> Float[Tensor, "g k s 3"]:
+    """Return the centres [m] of the collision spheres while a hand closes and goes down, at k equal steps."""
     shares = torch.linspace(0, 1, 6, device="cpu").tolist()
-    postures = [torch.lerp(pregrasp, configuration.joints, share) for share in shares]
-    return torch.stack([_centres(hand, Configuration(x, configuration.obj_from_hand)) for x in postures], 1)
+    postures = [
+        Configuration(
+            torch.lerp(opened.joints, closed.joints, share),
+            torch.lerp(opened.obj_from_hand, closed.obj_from_hand, share),  # equal rotations
+        )
+        for share in shares
+    ]
+    return torch.stack([_centres(hand, posture) for posture in postures], 1)
 
 
 def _lift(hand: Hand, configuration: Configuration, up: Float[Tensor, "3"]) -> Float[Tensor, "g k s 3"]:

@@ -186,7 +186,7 @@ def rank(problem: Problem, solved: Grasps) -> Grasps:
     features = success_features(hand, problem.shape, good, problem.center, problem.spec.friction, request.seed, weight)
     log_odds = success_log_odds(features, hand.name)
     if problem.obstacles is not None:
-        free = 1 - collision_probability(hand, good, problem.obstacles).to(log_odds)
+        free = 1 - collision_probability(hand, good, problem.obstacles, problem.spec.plane).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
     known = torch.ones_like(solved.status, dtype=torch.bool)
     known[solved.status == Status.OK] = is_known(problem.shape, good, problem.spec.friction) & (not problem.vague)
