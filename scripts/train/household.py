@@ -1,0 +1,91 @@
+"""Bodies as diverse as a household, any number of them, each with its convex parts: for fits that need many shapes.
+
+The families cycle. Sizes are drawn anew for each body, 15 to 250 mm in all. No body is decomposed: its parts are known
+by construction, and its mesh is their union. Nothing fitted on them has seen a scanned object.
+"""
+
+import dataclasses
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.read import save_cloud
+from torchgrasp.files import write_file
+from train.bodies import GOLDEN_ANGLE
+from train.forms import FORMS
+from train.implements import IMPLEMENTS
+from train.solids import Thing, find_rest, turn, unite
+from train.things import THINGS
+from train.vessels import VESSELS
+
+FAMILIES = {
+    maker.__name__: maker
+    for makers in itertools.zip_longest(VESSELS, FORMS, THINGS, IMPLEMENTS)
+    for maker in makers
+    if maker is not None
+}
+"""Makers by family. A new one changes all bodies: the family of a body depends on their number."""
+SEED = 46
+"""Of all draws, beside the number of the body."""
+TOPPLED = {"can", "bottle", "flask", "jar", "turned", "cup", "mug", "goblet", "vase", "pitcher", "gable", "spray"}
+"""Families that stand, but of which some bodies lie on their side."""
+LYING = 0.2
+"""Share of the bodies of these families that lie."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HouseholdBody:
+    """A body [m] that rests on z = 0 above the origin: its closed mesh, and the convex parts that fill it."""
+
+    name: str
+    family: str
+    mesh: trimesh.Trimesh
+    parts: list[trimesh.Trimesh]
+
+
+def author_household(k: int) -> HouseholdBody:
+    """Return the k-th body, always the same; k >= 0.
+
+    >>> body = author_household(12)
+    >>> body.mesh.is_volume and all(part.is_convex for part in body.parts)
+    True
+    """
+    family, thing = draw_thing(k)
+    mesh, parts = unite(thing)
+    pose = find_rest(mesh)
+    low, high = mesh.copy().apply_transform(pose).bounds
+    pose[:3, 3] -= (*(low + high)[:2] / 2, low[2])
+    for body in (mesh, *parts):
+        body.apply_transform(pose)
+    return HouseholdBody(f"{family}_{k}", family, mesh, parts)
+
+
+def draw_thing(k: int) -> tuple[str, Thing]:
+    """Return the family of the k-th body, and its solids [mm] before it comes to rest."""
+    family, draw = list(FAMILIES)[k % len(FAMILIES)], np.random.default_rng([SEED, k]).uniform
+    thing = FAMILIES[family](draw)
+    return family, turn(thing, "x", 90 if family in TOPPLED and draw() < LYING else 0)
+
+
+def write_household(folder: Path, count: int, first: int = 0) -> None:
+    """Write bodies as a folder of objects (`torchgrasp.data`) with one noisy view each.
+
+    The corners of the parts lie beside each mesh, as those of the library's own objects (`torchgrasp.data.shipped`).
+    """
+    entries = {}
+    for k in range(first, first + count):
+        body = author_household(k)
+        home = folder / body.name
+        camera = look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=body.mesh)
+        corners = [np.asarray(part.vertices) for part in body.parts]
+        arrays = {"corners": np.concatenate(corners), "counts": np.array([len(x) for x in corners])}
+        home.mkdir(parents=True, exist_ok=True)
+        write_file(home / "mesh.ply", body.mesh.export(file_type="ply"))
+        write_file(home / "parts.npz", lambda file, arrays=arrays: np.savez_compressed(file, **arrays))
+        save_cloud(partial_view(body.mesh, camera, seed=k), home / "view0_noisy.ply")
+        entries[body.name] = {"family": body.family, "views": {"view0": {"T_object_camera": camera.tolist()}}}
+    write_file(folder / "manifest.json", json.dumps({"objects": entries}))
