@@ -98,7 +98,8 @@ def _run_pool(
     except ImportError as error:
         raise MissingExtra("pebble", "sim") from error
     # The initializer imports the module of the function before the time of the first task begins.
-    pool = ProcessPool(workers, initializer=_begin, initargs=[function], context=multiprocessing.get_context("spawn"))
+    count, spawn = min(workers, len(waiting)), multiprocessing.get_context("spawn")
+    pool = ProcessPool(count, initializer=_begin, initargs=[function], context=spawn)
     ended = queue.SimpleQueue[int]()
     running: dict[int, tuple[Task, Future[Result]]] = {}
     try:

@@ -184,7 +184,7 @@ def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys, monkeyp
     assert "best-ranked grasps that pass" in capsys.readouterr().out
     page = (tmp_path / "out" / "evaluate.html").read_text()
     assert "<h1>Grasps of the barrett hand under dexgraspbench</h1>" in page and "bad_object" in page
-    assert cli.main([*words, "--grasps", "1", "--planned", str(tmp_path / "out" / "grasps")]) == 0
+    assert cli.main([*words, "--grasps", "1", "--planned", str(tmp_path / "out" / "grasps"), "--workers", "0"]) == 0
 
 
 @pytest.mark.parametrize(
