@@ -37,7 +37,7 @@ from torchgrasp.shape.completion.complete import Completion, complete_cloud
 from torchgrasp.shape.completion.silhouette import Outlines, Silhouette, silhouettes
 from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.posterior import Posterior
-from torchgrasp.sim.scene import Scene, StepContacts
+from torchgrasp.sim.scene import Scene
 from torchgrasp.sim.simulated_hand import SimulatedHand
 from torchgrasp.values import Certificate, Contacts, Grasps
 
@@ -83,7 +83,6 @@ def special(kind: type) -> Any:
         HollowShape: lambda: HollowShape.join(*[special(torchgrasp.ShapeGP)] * 2, special(PointCloud)),
         Scene: type("Nowhere", (Scene,), {name: nothing for name in ("__init__", *Scene.__abstractmethods__)}),
         SimulatedHand: simulated_hand,
-        StepContacts: StepContacts.none,
         torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
         torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
         Shape: lambda: special(torchgrasp.ShapeGP),

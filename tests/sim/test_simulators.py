@@ -11,6 +11,7 @@ import trimesh
 from tests.pinch import QUICK, close, cylinder, pinch, quick_trial
 from torchgrasp import Status, close_hand
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, Truth, pull_grasp
+from torchgrasp.evaluation.trial import TrialDriver, TrialRun
 from torchgrasp.sim import SceneSpec, open_scene
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Contacts
@@ -44,6 +45,37 @@ def test_simulators_agree_on_a_pull(pull):
     there, here = (pull_grasp(trial, protocol.with_trial(simulator=s)) for s in ("sapien", "mujoco"))
     assert there.passed == here.passed == (pull < 100)
     assert here.force == pytest.approx(there.force, rel=0.05)
+
+
+@pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
+def test_a_kept_run_goes_on_bitwise_as_the_run_itself_and_as_a_new_run_do(simulator):
+    hand, grasp = pinch("barrett")
+    spec = PULL.with_trial(simulator=simulator, closing="uncertainty", force=4.0).trial
+    driver = TrialDriver(GraspTrial(hand, grasp, Truth(cylinder())), spec)
+    first, new = closed(driver), closed(driver)
+    reopen = first.keep()
+    expected = pulled(first)
+    assert np.abs(expected[-1] - expected[0]).max() > 1e-6  # the pull moves something
+    for run in (new, reopen(), reopen()):
+        assert np.array_equal(pulled(run), expected)
+
+
+def closed(driver: TrialDriver) -> TrialRun:
+    run = driver.open()
+    for _ in run.close():
+        pass
+    return run
+
+
+def pulled(run: TrialRun) -> np.ndarray:
+    """Pull at the object; return its poses, the joints, and the forces that the noisy fingertips report."""
+    run.scene.pull(np.array([0.2, 0.0, 0.3]))
+    states = []
+    for _ in range(10):
+        run.step()
+        felt = run.observation.tactile.forces.numpy()
+        states.append(np.concatenate([x.ravel() for x in (run.scene.object_pose(), run.scene.joints(), felt)]))
+    return np.array(states)
 
 
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])

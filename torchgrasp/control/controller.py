@@ -94,7 +94,8 @@ class GraspController:
     def _prepare(self, reference: ClosingReference, approach: float) -> None:
         """Begin with a plan: first its approach, if there is one, and then its closing."""
         self.reference, self.attempts, self.stops, self.length = reference, 0, 0, approach
-        self.felt: list[Touches] = []  # at each stop, and in each closing
+        self.judges = self.options.attempts > 1 and reference.table is not None  # the grasp, before the lift
+        self.felt: list[Touches] = []  # at each stop, and in each closing that is judged
         self.guard = GuardedApproach(reference, self.options, approach, self.felt) if approach else None
         self._make_closing = functools.partial(make_closing, reference, self.mode, self.options)
         self._begin(self._make_closing())
@@ -200,9 +201,10 @@ class GraspController:
                 return self.targets.joints  # without a finger that opposes them, pressing ones push the object away
             return self.hold(observation, period)
         if not over or isinstance(self.closing, OpenLoopClosing):
-            if self.time == 0.0:
-                self.felt.append(Touches(self.reference, torch.zeros(0, 4, dtype=torch.float64)))
-            self.felt[-1].add(observation, self.closing.palm)
+            if self.judges:
+                if self.time == 0.0:
+                    self.felt.append(Touches(self.reference, torch.zeros(0, 4, dtype=torch.float64)))
+                self.felt[-1].add(observation, self.closing.palm)
             self.time += period
             return self.closing(observation, period)
         if self._make_hold is None:
@@ -210,7 +212,7 @@ class GraspController:
             self.hold = self.closing.press()
         else:
             self.hold = self._make_hold(self.reference, observation, self.targets.joints)
-        if self.options.attempts > 1 and self.reference.table is not None:
+        if self.judges:
             assert isinstance(self.closing, UncertaintyClosing)
             last = self.attempts >= self.options.attempts
             found = self.closing.displacement, self.closing.palm

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.least_forces import Balance, LeastForces, balance, friction_ratios
+from torchgrasp.control.least_forces import Balance, LeastForces, balance, cross_matrix, friction_ratios, lengths
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, low_pass
 from torchgrasp.errors import Status
@@ -120,7 +120,7 @@ class GripHold:
     def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
         max_force = 1000.0 if reference.max_force is None else reference.max_force  # [N], no hand presses as hard
         hand = reference.hand
-        self.reference, self.start, self.rest = reference, start, observation.joints
+        self.start, self.rest, self.stiffness = start.numpy(), observation.joints.numpy(), reference.kp.numpy()
         effort = np.array([hand.actuators[name].effort for name in hand.tree.joint_names])
         forces, _ = held_forces(reference, observation)
         self.normals, self.radius = _sensed(observation, reference.normals.numpy()), hand.tips.radius.numpy()
@@ -158,13 +158,12 @@ class GripHold:
         wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, floor, reserve)
         self._judge(wanted, jacobian, period)
         step = self._command(contacts, wanted, period) - self.sent
-        length = np.linalg.norm(step, axis=-1, keepdims=True)
-        self.sent = self.sent + step * np.minimum(1.0, fastest_rise * period / np.maximum(length, 1e-9))
+        length = np.maximum(lengths(step), 1e-9)[:, None]
+        self.sent = self.sent + step * np.minimum(1.0, fastest_rise * period / length)
         self.sent /= max(1.0, self.solver.share(self.sent, self.normals, jacobian))
         torque = np.einsum("cij,ci->j", jacobian, self.sent)
         share = min(self.time / RAMP, 1.0)
-        lead = torch.from_numpy(torque) / self.reference.kp
-        return self.start + share * (self.rest + lead - self.start)
+        return torch.from_numpy(self.start + share * (self.rest + torque / self.stiffness - self.start))
 
     def _bounded(self, push: np.ndarray) -> np.ndarray:
         """Return normal forces [N] of all fingers, reduced where a balance would need forces near the largest."""
@@ -175,7 +174,7 @@ class GripHold:
         """Filter the sensed forces, load and normals; return the contacts' grasp map and each finger's reserve [N]."""
         normals = _sensed(observation, self.normals)
         self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
-        self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
+        self.normals /= lengths(self.normals)[:, None]
         points = observation.tips.numpy() - self.radius[:, None] * self.normals
         touching, forces = observation.tactile.contact.numpy(), observation.tactile.forces.numpy()
         contacts = balance(points, touching)
@@ -207,8 +206,9 @@ class GripHold:
         if self.time < RAMP:
             return
         push, ratios = -(self.felt * self.normals).sum(-1), friction_ratios(self.felt, self.normals)
-        for i in np.flatnonzero(push > 0.5 * MIN_PUSH):
-            self.friction.update(float(min(ratios[i], 2.0)), float(push[i]), bool(self.sliding[i]))
+        for ratio, force, slides in zip(ratios.tolist(), push.tolist(), self.sliding.tolist(), strict=True):
+            if force > 0.5 * MIN_PUSH:
+                self.friction.update(min(ratio, 2.0), force, slides)
         self._release(period)
 
     def _release(self, period: float) -> None:
@@ -240,7 +240,7 @@ class GripHold:
             self.trim = self.trim - period * 4.0 * lacking[:, None] * self.normals
             flat = self.trim.ravel()
             self.trim = (flat - contacts.inverse @ (contacts.wrench @ flat)).reshape(-1, 3)
-            largest, bound = (float(np.linalg.norm(x, axis=-1).max()) for x in (self.trim, 0.5 * wanted))
+            largest, bound = (float(lengths(x).max()) for x in (self.trim, 0.5 * wanted))
             self.trim = self.trim * min(1.0, bound / max(largest, 1e-9))
         missing = self.load - 0.8 * self.carried  # carrying all of it would press ever harder on a rigid table
         return wanted + self.trim - (contacts.inverse @ missing).reshape(-1, 3)
@@ -251,11 +251,11 @@ def push_reserve(contacts: Balance, normals: np.ndarray, arm: np.ndarray, fricti
 
     The push acts at `arm` [m] from the middle of the contacts. The fingers share it like springs of equal stiffness.
     """
-    pushes = np.concatenate([np.eye(3), np.cross(arm, np.eye(3)).T])
+    pushes = np.concatenate([np.eye(3), cross_matrix(arm)])
     share = (contacts.inverse @ pushes).reshape(-1, 3, 3)
     along = np.einsum("fi,fij->fj", normals, share)
     across = share - normals[:, :, None] * along[:, None]
-    return np.hypot(np.linalg.norm(along, axis=-1), np.linalg.norm(across, ord=2, axis=(1, 2)) / friction)
+    return np.hypot(lengths(along), np.linalg.svd(across, compute_uv=False)[:, 0] / friction)
 
 
 def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:

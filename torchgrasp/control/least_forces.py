@@ -17,12 +17,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from torchgrasp.plan.forces import grasp_map
+from torchgrasp.geometry.frames import skew
 
 Array = np.ndarray
 
 PENALTY, KNEE = 500.0, 0.9
 """Weight [N] of the penalty on joint torques and normal forces, and the share of their limits where it begins."""
+
+_AXES = skew(torch.eye(3, dtype=torch.float64)).reshape(3, 9).numpy()  # of the cross products with the axes
 
 
 class Balance(NamedTuple):
@@ -43,16 +45,29 @@ class Balance(NamedTuple):
 
 def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = True) -> Balance:
     """Return the grasp map at contact points [m] that touch, its pseudo-inverse and its null space, from one SVD."""
-    wrench = grasp_map(torch.from_numpy(points)).numpy() * np.repeat(np.broadcast_to(touching, len(points)), 3)
+    arms = points - torch.from_numpy(points).mean(0).numpy()  # NumPy sums five points in another order
+    wrench = np.empty((6, *arms.shape))
+    wrench[:3], wrench[3:] = np.eye(3)[:, None], cross_matrix(arms).transpose(1, 0, 2)
+    wrench = (wrench * np.reshape(touching, (-1, 1))).reshape(6, -1)
     left, values, right = np.linalg.svd(wrench)
     rank = int((values > 1e-12 * values[0]).sum())  # that of contacts on one line is 5
     return Balance(wrench, (right[:rank].T / values[:rank]) @ left[:, :rank].T, right[rank:].T)
 
 
+def cross_matrix(arms: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """Return the matrix of the cross product with each arm, as `skew` of `geometry.frames`."""
+    return (arms @ _AXES).reshape(*arms.shape, 3)
+
+
+def lengths(vectors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
+    """Return the lengths of vectors, sooner than `np.linalg.norm`."""
+    return np.sqrt((vectors * vectors).sum(-1))
+
+
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
     """Return each finger's ratio of tangential to normal force; the ratio is infinite if the finger does not press."""
     push = -(forces * normals).sum(-1)
-    slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
+    slide = lengths(forces + push[:, None] * normals)
     return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
 
 
@@ -65,6 +80,8 @@ class LeastForces:
 
     def __init__(self, start: Float[Array, "f 3"], effort: Float[Array, " j"], most: float) -> None:
         self.forces, self.start, self.effort, self.most = start, start, effort, most
+        self.growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # internal forces, if the load has grown
+        self.strides = 2.0 ** np.arange(8)  # multiples of a step that is safe for every self-concordant function
 
     def solve(
         self,
@@ -88,21 +105,21 @@ class LeastForces:
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], push])
         gap = 0.01 * (float(np.linalg.norm(load[:3])) + float(floor.sum()))  # distance from the cones beyond the noise
         barrier = _Barrier(contacts, normals, limits, load, gap, reserve)
-        growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # added internal forces, if the load has grown
-        tried = barrier.place(self.forces) + growth[:, None] * barrier.place(self.start, 0.0)
+        tried = barrier.place(self.forces) + self.growth[:, None] * barrier.place(self.start, 0.0)
         needed = 1.25 * float(friction_ratios(contacts.inner(self.start), normals).max())
         friction = max(friction, needed) if math.isfinite(needed) else friction
-        z = barrier.choose(tried, friction, floor)
-        lengths = 2.0 ** np.arange(8)  # multiples of a step that is safe for every self-concordant function
-        for _ in range(8 if math.isfinite(barrier.squared) else 0):  # no cone contains a finger that does not press
-            step, decrement = barrier.newton(z)
-            trial = z + np.minimum(lengths / (1 + decrement), 1.0)[:, None] * step
-            value = barrier.value(trial)
-            if not np.isfinite(value).any():
-                break
-            z = trial[int(value.argmin())]
-            if decrement < 0.3:
-                break
+        with np.errstate(invalid="ignore", divide="ignore"):  # of logarithms outside the cones
+            z = barrier.choose(tried, friction, floor)
+            for _ in range(8 if math.isfinite(barrier.squared) else 0):  # no cone contains a finger that does not press
+                step, decrement = barrier.newton(z)
+                trial = z + np.minimum(self.strides / (1 + decrement), 1.0)[:, None] * step
+                value = barrier.value(trial)
+                best = int(value.argmin())
+                if not math.isfinite(value[best]):
+                    break
+                z = trial[best]
+                if decrement < 0.3:
+                    break
         self.forces = barrier.forces(z)
         return self.forces
 
@@ -148,25 +165,27 @@ class _Barrier:
     def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
         """Return the best of g coordinates z; if none is feasible, raise friction and lower floors and reserves."""
         push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
-        across = np.sqrt(((forces**2).sum(-1) - push**2).clip(min=0.0))
+        across = np.sqrt(np.maximum((forces**2).sum(-1) - push**2, 0.0))
         above = (push > floor).all(-1)
-        self.floor = floor if above.any() else np.minimum(floor, 0.5 * push[-1]).clip(min=0.0)
+        above = above if (reached := bool(above.any())) else np.arange(len(tried)) == len(tried) - 1
+        self.floor = floor if reached else np.maximum(np.minimum(floor, 0.5 * push[-1]), 0.0)
         self.reserve = np.minimum(self.reserve, self.floor)
         left = push - self.reserve
         ratio = np.where(left > 0, across / np.maximum(left, 1e-12), np.inf).max(-1)
-        ratio = np.where(above if above.any() else np.arange(len(tried)) == len(tried) - 1, ratio, np.inf)
-        self.squared = max(friction, 1.05 * float(ratio.min()) if ratio.min() >= friction else 0.0) ** 2
+        ratio = np.where(above, ratio, np.inf)
+        least = float(ratio.min())
+        self.squared = max(friction, 1.05 * least if least >= friction else 0.0) ** 2
         value = self.value(tried)
-        return tried[int((value if np.isfinite(value).any() else ratio).argmin())]
+        best = int(value.argmin())
+        return tried[best if math.isfinite(value[best]) else int(ratio.argmin())]
 
     def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
         """Return the objective at each row of coordinates z; it is infinite outside the friction cones."""
         n, t = z @ self.push.T + self.push_0, z @ self.tau.T + self.tau_0
         cone = self.squared * (n - self.reserve) ** 2 + n * n - (self.forces(z) ** 2).sum(-1)
         inside = ((cone > 0) & (n > self.floor)).all(-1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            logs = np.log(cone).sum(-1) + np.log(n - self.floor).sum(-1)
-        over = PENALTY * ((np.abs(t) - KNEE).clip(min=0.0) ** 2).sum(-1)
+        logs = np.log(cone).sum(-1) + np.log(n - self.floor).sum(-1)
+        over = PENALTY * (np.maximum(np.abs(t) - KNEE, 0.0) ** 2).sum(-1)
         return np.where(inside, n.sum(-1) + over - self.gap * logs, np.inf)
 
     def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
@@ -176,7 +195,7 @@ class _Barrier:
         left = n - self.reserve
         cone = self.squared * left * left + n * n - (force * force).sum(-1)
         half = (self.squared * left + n)[:, None] * push - np.einsum("ni,nik->nk", force, self.rows)  # of the gradient
-        above, over = n - self.floor, np.sign(t) * (np.abs(t) - KNEE).clip(min=0.0)
+        above, over = n - self.floor, np.sign(t) * np.maximum(np.abs(t) - KNEE, 0.0)
         gradient = push.sum(0) + 2 * PENALTY * over @ self.tau - gap * ((2 / cone) @ half + (1 / above) @ push)
         hessian = (self.tau.T * (2 * PENALTY * (over != 0))) @ self.tau + gap * ((push.T / above**2) @ push)
         hessian += gap * ((half.T * (4 / cone**2)) @ half - 2 * (1 + self.squared) * (push.T / cone) @ push)

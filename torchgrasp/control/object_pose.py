@@ -95,12 +95,12 @@ class Touches:
     def add(self, observation: Observation, palm: Float[Tensor, "3"]) -> None:
         """Add one observation to the averages; `palm` [m] is how far the palm is displaced from its plan."""
         sensed = observation.tactile
-        placed = torch.isfinite(sensed.points).all(-1) & torch.isfinite(sensed.normals).all(-1) & sensed.contact
-        self.points = self.points + torch.where(placed[:, None], sensed.points + palm, 0.0)
-        self.normals = self.normals + torch.where(placed[:, None], sensed.normals, 0.0)
-        self.count = self.count + placed
+        if bool(sensed.contact.any()):
+            placed = torch.isfinite(sensed.points).all(-1) & torch.isfinite(sensed.normals).all(-1) & sensed.contact
+            self.points = self.points + torch.where(placed[:, None], sensed.points + palm, 0.0)
+            self.normals = self.normals + torch.where(placed[:, None], sensed.normals, 0.0)
+            self.count, self.nothing = self.count + placed, False
         self.tips, self.contact, self.palm = observation.tips + palm, sensed.contact, palm
-        self.nothing = self.nothing and not bool(sensed.contact.any())
 
     @property
     def felt(self) -> Bool[Tensor, "f"]:

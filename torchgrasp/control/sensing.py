@@ -143,7 +143,7 @@ class FingertipSensor:
         self.sensed = no_contact(fingers=fingers)
         self.switched = torch.zeros(fingers, dtype=torch.bool)
         self.reports = [self.sensed]
-        self.alive = reference.alive
+        self.alive, self.whole = reference.alive, bool(reference.alive.all())
 
     def __call__(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"], period: float) -> TactileState:
         """Return what the fingertip sensors report at the end of a control tick, delayed as the sensor is.
@@ -163,7 +163,7 @@ class FingertipSensor:
         if self.model.kind == "binary":  # a switch closes at 0.45 N and opens at TOUCH_ON
             self.switched = torch.where(self.switched, report.reading > TOUCH_ON, report.reading >= 0.45)
             report = feel_flags(report, self.switched)
-        if not bool(self.alive.all()):
+        if not self.whole:
             nothing, column = no_contact(fingers=len(self.alive)), self.alive[:, None]
             silence = lambda x, no: torch.where(self.alive if x.ndim == 1 else column, x, no)  # noqa: E731
             report = map_tensors(silence, report, nothing)

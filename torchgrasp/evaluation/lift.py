@@ -190,15 +190,16 @@ class _Lift:
 
     def _record(self) -> None:
         """Record a tick; raise an error if the simulation has diverged or the object is too far away."""
-        robot, scene, pose = self.run.robot, self.run.scene, self.run.scene.object_pose()
+        robot, scene = self.run.robot, self.run.scene
+        pose, joints = scene.object_pose(), scene.joints()
         arrays = (
             np.float64(robot.steps * self.spec.timestep), pose, scene.hand_pose(), scene.neighbour_poses(),
-            scene.joints(), robot.finger.sum(), pose[:3, :3] @ scene.centre + pose[:3, 3], np.array(self.run.felt),
+            joints, robot.finger.sum(), pose[:3, :3] @ scene.centre + pose[:3, 3], np.array(self.run.felt),
         )  # fmt: skip
         tick = Tick(*map(torch.as_tensor, arrays), blend=self.run.controller.blend, truth=robot.truth)
         self.ticks.append(tick)
         moved = self._moved()
-        if not bool(torch.isfinite(tick.joints).all()) or not math.isfinite(moved):
+        if not np.isfinite(joints).all() or not math.isfinite(moved):
             raise FloatingPointError
         if moved > 0.5 + self.spec.lift_height:  # [m]
             self.pushed = self.pushed or moved

@@ -46,7 +46,7 @@ class PullResult(Value):
 @checked
 @single_threaded
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
-    """Close a hand on the true object and pull along the world's axes, each in a fresh scene, until a pull fails.
+    """Close a hand on the true object and pull along the world's axes, from the same grasp, until a pull fails.
 
     The object's motion includes its motion during the closing. `protocol` may be a name in `PROTOCOLS`.
 
@@ -70,31 +70,32 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Grasp and pull the object in each direction, each time in a fresh scene, until one pull fails."""
-    started = time.process_time()
-    status, largest, force, tried = Status.OK, np.zeros(2), math.nan, 0
-    while status is Status.OK and tried < len(DIRECTIONS):
-        status, motion, pressed = _pull(driver.open(), spec, DIRECTIONS[tried])
-        largest, tried = np.maximum(largest, motion), tried + 1
-        force = pressed if math.isnan(force) else force
+    """Grasp the object once, and pull it in each direction from the grasp on, until one pull fails."""
+    started, run = time.process_time(), driver.open()
+    start, force, tried = run.scene.object_pose(), math.nan, 1
+    status, largest = Status.START_OVERLAP, np.zeros(2)
+    if run.starts:
+        for _ in run.close():
+            pass
+        force = float(run.robot.force.mean())
+        status, largest = _look(run, spec, start)
+        status = Status.EJECTED if status is Status.MOVED else status
+    if status is Status.OK:
+        largest, reopen = np.zeros(2), run.keep()
+        for tried, direction in enumerate(DIRECTIONS, start=1):
+            status, motion = _pull(run if tried == 1 else reopen(), spec, start, direction)
+            largest = np.maximum(largest, motion)
+            if status is not Status.OK:
+                break
     moved, turned = largest.tolist()
     return PullResult(status is Status.OK, status, tried, moved, turned, force, time.process_time() - started)
 
 
-def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status, np.ndarray, float]:
-    """Close the hand and pull in one direction; return status, largest motion [m, rad], and force [N] before it."""
+def _pull(run: TrialRun, spec: PullSpec, start: np.ndarray, direction: np.ndarray) -> tuple[Status, np.ndarray]:
+    """Pull in one direction; return status and largest motion [m, rad] from the pose `start`."""
     interval = 0.2  # interval [s] at which the pulled object's motion is checked
-    if not run.starts:
-        return Status.START_OVERLAP, np.zeros(2), math.nan
-    start = run.scene.object_pose()
-    for _ in run.close():
-        pass
-    force = float(run.robot.force.mean())
-    status, motion = _look(run, spec, start)
-    if status is not Status.OK:
-        return Status.EJECTED if status is Status.MOVED else status, motion, force
     run.scene.pull(spec.acceleration * run.mass * direction)
-    largest = np.zeros(2)
+    status, largest = Status.OK, np.zeros(2)
     for _ in range(round(spec.seconds / interval)):
         for _ in range(run.robot.ticks(interval)):
             run.step()
@@ -102,7 +103,7 @@ def _pull(run: TrialRun, spec: PullSpec, direction: np.ndarray) -> tuple[Status,
         largest = np.maximum(largest, motion)
         if status is not Status.OK:
             break
-    return status, largest, force
+    return status, largest
 
 
 def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.ndarray]:

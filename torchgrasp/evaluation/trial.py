@@ -1,8 +1,9 @@
 """The driver of simulated trials: opens a fresh scene, approaches, closes and presses."""
 
+import copy
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -191,6 +192,12 @@ class TrialRun:
     def starts(self) -> bool:
         """Whether the hand's initial penetration of the object is within the limit, so that the trial starts."""
         return self.overlap <= self.spec.overlap
+
+    def keep(self) -> "Callable[[], TrialRun]":
+        """Return a function that returns runs in the present state of this one, which go on bitwise as this one."""
+        reopen, hand = self.scene.keep(), self.robot.reference.hand
+        kept = copy.deepcopy(self, {id(x): x for x in (self.scene, hand)})
+        return lambda: copy.deepcopy(kept, {id(self.scene): reopen(), id(hand): hand})
 
     def approach(self) -> Iterator[None]:
         """Move the opened hand straight to its pre-grasp; in a guarded approach, a touch stops the hand."""

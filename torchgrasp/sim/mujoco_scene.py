@@ -1,6 +1,6 @@
 """A simulated scene in MuJoCo, and its model in MJCF, MuJoCo's XML format."""
 
-import functools
+import copy
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Link, Urdf
-from torchgrasp.sim.scene import STILL, ContactPoint, Scene
+from torchgrasp.sim.scene import STILL, Scene
 from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, pair_masks
 
 OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
@@ -52,7 +52,7 @@ class MujocoScene(Scene):
         self.root = model.body(urdf.root).id
         self.tips = [model.body(name).id for name in spec.tip_links]
         self.neighbours = [model.body(NEIGHBOUR.format(k)).id for k in range(len(spec.neighbours))]
-        self._body_of = model.geom_bodyid.tolist()
+        self._body_of, self._wrench = model.geom_bodyid.tolist(), np.zeros(6)
         parents = model.body_parentid.tolist()
         self._map_contacts([0], (parents[tip] if model.body_jntnum[tip] == 0 else None for tip in self.tips))
         data.qpos[self._positions] = [spec.joints[name] for name in self.joint_names]
@@ -62,23 +62,37 @@ class MujocoScene(Scene):
             self._move_mount(slide.name, slide.start, 0.0)
         mujoco.mj_step1(model, data)
 
-    def _advance(self) -> Iterator[tuple[int, int, Callable[[], list[ContactPoint]]]]:
-        """Advance by one timestep; yield each pair of bodies that touch, with a function that reads their contact."""
-        if self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].any():  # it has diverged
+    def _advance(self) -> Iterator[tuple[int, int, tuple[int, np.ndarray, np.ndarray]]]:
+        """Advance by one timestep; yield each pair of bodies that touch, with number, axes and place of the contact."""
+        if any(self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].tolist()):  # it has diverged
             self.data.qpos[:] = self.data.xpos[:] = np.nan
             return
         self._mujoco.mj_step2(self.model, self.data)
-        for k, (first, second) in enumerate(self.data.contact.geom.tolist()):
-            yield self._body_of[first], self._body_of[second], functools.partial(self._read, k)
+        found = self.data.contact
+        for k, (first, second) in enumerate(found.geom.tolist()):
+            yield self._body_of[first], self._body_of[second], (k, found.frame[k], found.pos[k])
         self._mujoco.mj_step1(self.model, self.data)
 
-    def _read(self, k: int) -> list[ContactPoint]:
-        """Return MuJoCo's contact point number k with its impulse and force, as a list of one."""
-        wrench, found = np.zeros(6), self.data.contact
+    def _read(self, contact: tuple[int, np.ndarray, np.ndarray], sign: float) -> list[tuple[float, list[float]]]:
+        """Return size and numbers of MuJoCo's contact point, as a list of one."""
+        k, axes, place = contact  # the axes in rows; the first points from the first body to the second
+        wrench = self._wrench
         self._mujoco.mj_contactForce(self.model, self.data, k, wrench)
-        axes = found.frame[k].reshape(3, 3)  # in rows; the first points from the first body to the second
         size = max(float(wrench[0]), 0.0) * self.timestep
-        return [ContactPoint(size * axes[0], size, found.pos[k], wrench[:3] @ axes)]
+        force = (wrench[:3] @ axes.reshape(3, 3)).tolist()
+        impulse, moment = [sign * size * x for x in axes[:3].tolist()], [size * x for x in place.tolist()]
+        return [(size, [*impulse, *moment, size, *(sign * x for x in force)])]
+
+    def keep(self) -> "Callable[[], MujocoScene]":
+        """Return a function that opens scenes in the present state of this one; they share its model."""
+        kept = copy.copy(self.data)
+
+        def reopen() -> MujocoScene:
+            scene = copy.copy(self)
+            scene.data = copy.copy(kept)
+            return scene
+
+        return reopen
 
     def drive(self, targets: np.ndarray) -> None:
         """Set the target [rad] of every driven joint."""
@@ -115,8 +129,8 @@ class MujocoScene(Scene):
 
     def _pose(self, body: int) -> np.ndarray:
         """Return the pose (4, 4) of a body in the world's frame, given its index."""
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
+        pose = np.zeros((4, 4))
+        pose[:3, :3], pose[:3, 3], pose[3, 3] = self.data.xmat[body].reshape(3, 3), self.data.xpos[body], 1.0
         return pose
 
     def _move_mount(self, joint: str, target: float, speed: float) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from torchgrasp.errors import MissingExtra
 from torchgrasp.files import temporary_folder, write_file
-from torchgrasp.sim.scene import STILL, ContactPoint, Scene, StepContacts
+from torchgrasp.sim.scene import STILL, Scene, StepContacts
 from torchgrasp.sim.scene_spec import (
     ARMATURE,
     MOUNT_DRIVE,
@@ -139,11 +139,23 @@ def import_sapien() -> tuple[Any, Any]:
     return sapien, physx
 
 
+def _noted(method: Callable[..., Any]) -> Any:
+    """Let a method note its calls, which `SapienScene.keep` repeats."""
+
+    @functools.wraps(method)
+    def call(self: "SapienScene", *args: Any) -> Any:
+        self._calls.append((call, args))
+        return method(self, *args)
+
+    return call
+
+
 class SapienScene(Scene):
     """A simulated scene in SAPIEN: table, object and hand."""
 
     def __init__(self, spec: SceneSpec) -> None:
         super().__init__(spec)
+        self._calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         sapien, physx = import_sapien()
         self.system, self.scene = open_world(sapien, physx, spec.gravity, spec.timestep, spec.patch > 0.0)
         slick = physx.PhysxMaterial(spec.body_friction, spec.body_friction, 0.0)
@@ -183,13 +195,42 @@ class SapienScene(Scene):
         self._sensor_axes = [_matrix(tip.joint.pose_in_child)[:3, :3] for tip in self.tips]
         self._tip_index = [self.hand.links.index(tip) for tip in self.tips]
 
-    def _advance(self) -> Iterator[tuple[Any, Any, Callable[[], Iterable[ContactPoint]]]]:
-        """Advance by one timestep; yield each pair of bodies that touch, with a function that reads their contacts."""
+    def keep(self) -> "Callable[[], SapienScene]":
+        """Return a function that opens scenes in the present state of this one.
+
+        It repeats all calls in a fresh scene, because PhysX packs its bodies, but not the state of its contacts.
+        """
+        calls = tuple(self._calls)
+
+        def reopen() -> SapienScene:
+            scene = SapienScene(self.spec)
+            for call, args in calls:
+                call(scene, *args)
+            return scene
+
+        return reopen
+
+    @_noted
+    def _simulate(self) -> None:
+        """Advance by one timestep."""
         if self._pulled:
             self.body.add_force_torque(self._force, self._torque)
-        self.scene.step()
+        self.system.step()
+
+    def _advance(self) -> Iterator[tuple[Any, Any, Any]]:
+        """Advance by one timestep; yield each pair of bodies that touch, with their contact."""
+        self._simulate()
         for contact in self.system.get_contacts():
-            yield *contact.bodies, functools.partial(_read, contact)
+            yield *contact.bodies, contact
+
+    def _read(self, contact: Any, sign: float) -> Iterator[tuple[float, list[float]]]:
+        """Yield size and numbers of each point that presses; SAPIEN reports the impulse on the first body."""
+        for point in contact.points:
+            impulse = point.impulse
+            squared = impulse.dot(impulse)
+            if squared:
+                size = float(np.sqrt(squared))
+                yield size, [*(-sign * impulse).tolist(), *(size * point.position).tolist(), size]
 
     def step(self) -> StepContacts:
         """Advance by one timestep and return the sums of the contacts, with forces measured at the tips' base joints.
@@ -199,22 +240,25 @@ class SapienScene(Scene):
         contacts = super().step()
         touching = [i for i, weight in enumerate(contacts.weight.tolist()) if weight > 0.0]
         if touching:
-            wrenches = self.hand.get_link_incoming_joint_forces().astype(float)
+            wrenches = self.hand.get_link_incoming_joint_forces()[self._tip_index, :3].astype(float)
             for i in touching:
                 world_from_sensor = self._pose(self.tips[i])[:3, :3].dot(self._sensor_axes[i])
-                contacts.force[i] = world_from_sensor.dot(wrenches[self._tip_index[i], :3])
+                contacts.force[i] = world_from_sensor.dot(wrenches[i])
         return contacts
 
+    @_noted
     def drive(self, targets: np.ndarray) -> None:
         """Set the target [rad] of every driven joint."""
-        for joint, target in zip(self._driven, targets, strict=True):
-            joint.set_drive_target(float(target))
+        for joint, target in zip(self._driven, targets.tolist(), strict=True):
+            joint.set_drive_target(target)
 
+    @_noted
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
         """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
         self._force, self._torque = np.asarray(force, np.float32), np.asarray(torque, np.float32)
         self._pulled = bool(self._force.any() or self._torque.any())
 
+    @_noted
     def displace(self, shift: np.ndarray) -> None:
         """Move the object by a displacement (3,) [m]."""
         sapien, _ = import_sapien()
@@ -227,13 +271,15 @@ class SapienScene(Scene):
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the driven joints."""
-        frames = np.array([_matrix(link.entity_pose) for link in self._children]) @ self._frames
+        poses = [link.entity_pose.to_transformation_matrix() for link in self._children]
+        frames = np.array(poses, float) @ self._frames
         axes, arms = frames[:, :3, 0], points[:, None, :] - frames[:, :3, 3]
         following, last = [1, 2, 0], [2, 0, 1]  # coordinates of a cross product; np.cross takes much longer
         turned = axes.take(following, -1) * arms.take(last, -1) - axes.take(last, -1) * arms.take(following, -1)
         columns = np.where(self._slides[:, None], axes, turned) * self._moves[..., None]
         return columns.transpose(0, 2, 1)
 
+    @_noted
     def penetration(self) -> float:
         """Return the largest depth [m] by which the hand penetrates a body or itself, after a step without gravity."""
         bodies = [self.body, *self.neighbours]
@@ -249,6 +295,7 @@ class SapienScene(Scene):
         """Return the pose (4, 4) of a body in the world's frame."""
         return _matrix(body.entity_pose)
 
+    @_noted
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
         """Set target [m] and target speed [m/s] of a joint of the mount."""
         self._mount[joint].set_drive_target(float(target))
@@ -258,10 +305,3 @@ class SapienScene(Scene):
 def _matrix(pose: Any) -> np.ndarray:
     """Return a SAPIEN pose as a matrix (4, 4)."""
     return pose.to_transformation_matrix().astype(float)
-
-
-def _read(contact: Any) -> Iterator[ContactPoint]:
-    """Yield the points of a contact, with the impulse on its second body; SAPIEN reports that on the first body."""
-    for point in contact.points:
-        impulse = point.impulse
-        yield ContactPoint(-impulse, float(np.sqrt(impulse.dot(impulse))), point.position)

@@ -6,11 +6,11 @@ Every trial opens a fresh scene: only then are two runs bitwise equal. The world
 import abc
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from torchgrasp.checks import Range, checked
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
 
@@ -31,22 +31,6 @@ class StepContacts:
     force: np.ndarray  # of each fingertip on the object (f, 3) [N], friction included
     stray: np.ndarray  # sums of other impulses (3,) [N s]: hand on neighbours, hand on table, links on object
 
-    @classmethod
-    @checked
-    def none(cls, fingers: Annotated[int, Range(1, 1000)] = 3) -> "StepContacts":
-        """Return the sums of a step without any contact, all of them zero, for a number of fingers."""
-        impulse, moment, force = np.zeros((3, fingers, 3))
-        return cls(impulse, moment, np.zeros(fingers), np.zeros(fingers, dtype=bool), force, np.zeros(3))
-
-
-class ContactPoint(NamedTuple):
-    """A point where two bodies touch, with the impulse and the force on the second body."""
-
-    impulse: np.ndarray  # normal impulse (3,) [N s]
-    size: float  # length of the impulse [N s]
-    place: np.ndarray  # (3,) [m]
-    force: np.ndarray | float = 0.0  # (3,) [N], friction included; 0 if the simulator does not report it
-
 
 class Scene(abc.ABC):
     """The interface of a simulated scene: table, object, neighbours and hand.
@@ -63,7 +47,7 @@ class Scene(abc.ABC):
     neighbours: list[Any]
 
     def __init__(self, spec: SceneSpec) -> None:
-        self.timestep, self.centre = spec.timestep, np.asarray(spec.mesh.center_mass, float)
+        self.spec, self.timestep, self.centre = spec, spec.timestep, np.asarray(spec.mesh.center_mass, float)
 
     def _map_contacts(self, tables: Iterable[Any], carriers: Iterable[Any]) -> None:
         """Store which index into `StepContacts.stray` belongs to each body, and which finger to each link.
@@ -79,28 +63,40 @@ class Scene(abc.ABC):
 
     def step(self) -> StepContacts:
         """Advance by one timestep and return the hand's contacts during it, summed per finger."""
-        contacts = StepContacts.none(len(self.tips))
-        for first, second, read in self._advance():
+        sums, finger, stray = [[0.0] * 10 for _ in self.tips], [False] * len(self.tips), [0.0] * 3
+        for first, second, contact in self._advance():
             if (first in self._place_of) == (second in self._place_of):
                 continue
             link, other, sign = (second, first, -1.0) if first in self._place_of else (first, second, 1.0)
-            finger = self._finger_of.get(link) if other == self.body else None
-            if finger is None:
-                contacts.stray[self._place_of[other]] += sum(point.size for point in read())
+            touching = self._finger_of.get(link) if other == self.body else None
+            if touching is None:
+                stray[self._place_of[other]] += sum(size for size, _ in self._read(contact, sign))
                 continue
-            for impulse, size, place, force in read():
+            for size, numbers in self._read(contact, sign):
                 if size > 0.0:
-                    contacts.finger[finger] = True
-                    if link == self.tips[finger]:
-                        contacts.impulse[finger] += sign * impulse
-                        contacts.moment[finger] += size * place
-                        contacts.weight[finger] += size
-                        contacts.force[finger] += sign * force
-        return contacts
+                    finger[touching] = True
+                    if link == self.tips[touching]:
+                        row = sums[touching]  # of Python's numbers, which are faster than short arrays
+                        for column, number in enumerate(numbers):
+                            row[column] += number
+        found = np.array(sums)
+        return StepContacts(found[:, :3], found[:, 3:6], found[:, 6], np.array(finger), found[:, 7:], np.array(stray))
 
     @abc.abstractmethod
-    def _advance(self) -> Iterable[tuple[Any, Any, Callable[[], Iterable[ContactPoint]]]]:
-        """Advance by one timestep; yield each pair of bodies that touch, with a function that reads their contacts."""
+    def _advance(self) -> Iterable[tuple[Any, Any, Any]]:
+        """Advance by one timestep; yield each pair of bodies that touch, with an argument of `_read`."""
+
+    @abc.abstractmethod
+    def _read(self, contact: Any, sign: float) -> Iterable[tuple[float, Iterable[float]]]:
+        """Yield size [N s] and numbers of each point of a contact; points with an impulse of zero may be left out.
+
+        The numbers are normal impulse (3,) [N s], place times size (3,) [N s m], size, and force (3,) [N] if known:
+        on the second body, or on the first if the `sign` is -1.
+        """
+
+    @abc.abstractmethod
+    def keep(self) -> "Callable[[], Scene]":
+        """Return a function that opens scenes in the present state of this one, which go on bitwise as this one."""
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:

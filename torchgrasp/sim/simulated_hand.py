@@ -9,7 +9,7 @@ import torch
 from torchgrasp.checks import Range, checked
 from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
 from torchgrasp.errors import BadArgument
-from torchgrasp.sim.scene import Scene, StepContacts
+from torchgrasp.sim.scene import Scene
 from torchgrasp.sim.scene_spec import SceneSpec
 from torchgrasp.specs import Simulator
 
@@ -90,24 +90,24 @@ class SimulatedHand:
             rotation = self.scene.hand_pose()[:3, :3]
             self.scene.shift(rotation @ palm, rotation @ (palm - last) / self.period)
         self._palm = palm
-        contacts, before = StepContacts.none(len(self.force)), self.stray.copy()
+        impulse, moment, self.pushes = np.zeros((3, *self.pushes.shape))
+        weight, before = np.zeros(len(self.force)), self.stray.copy()
         for _ in range(self.substeps):
             step = self.scene.step()
             self.steps += 1
-            contacts.impulse[:] += step.impulse
-            contacts.moment[:] += step.moment
-            contacts.weight[:] += step.weight
-            contacts.force[:] += step.force / self.substeps  # the mean force of the tick
+            impulse += step.impulse
+            moment += step.moment
+            weight += step.weight
+            self.pushes += step.force / self.substeps  # the mean force of the tick
             self.finger = step.finger
-            for i, weight in enumerate(step.weight.tolist()):
-                if weight > 0.0:
-                    self.first_touch[i] = min(self.first_touch[i], self.steps)
-            if step.stray.any():
+            if math.inf in self.first_touch:
+                touches = zip(self.first_touch, step.weight.tolist(), strict=True)
+                self.first_touch = [self.steps if at > self.steps and size > 0.0 else at for at, size in touches]
+            if any(step.stray.tolist()):
                 self.first_stray[(step.stray > 0) & np.isinf(self.first_stray)] = self.steps
                 self.stray += step.stray
         self.most_stray = np.maximum(self.most_stray, (self.stray - before) / self.period)
-        self.pushes = contacts.force
-        return self._observe(contacts)
+        return self._observe(impulse, moment, weight)
 
     def unbalanced(self) -> float:
         """Return the size of the sum of all fingertip forces over the sum of their sizes; NaN without any forces."""
@@ -119,18 +119,17 @@ class SimulatedHand:
         """Return the number of control ticks in a time [s], at least one."""
         return max(1, round(seconds / self.period))
 
-    def _observe(self, contacts: StepContacts) -> Observation:
-        """Return what the hand measures at the end of a tick, given the true contact forces summed over the tick."""
-        world_from_hand = self.scene.hand_pose()
+    def _observe(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Observation:
+        """Return what the hand measures at the end of a tick, given sums over the tick as in `StepContacts`."""
+        world_from_hand, tips = self.scene.hand_pose(), self.scene.tip_poses()
         rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
-        tips = self.scene.tip_poses()
         centres = (tips @ self._centres[:, :, None])[:, :3, 0]
-        sizes = np.linalg.norm(contacts.impulse, axis=-1)
+        sizes = np.linalg.norm(impulse, axis=-1)
         self.force = sizes / self.period
         with np.errstate(invalid="ignore", divide="ignore"):
-            points = contacts.moment / contacts.weight[:, None]
-            normals = -contacts.impulse / sizes[:, None]
-        vectors = torch.from_numpy(np.concatenate([contacts.force, normals]) @ rotation)
+            points = moment / weight[:, None]
+            normals = -impulse / sizes[:, None]
+        vectors = torch.from_numpy(np.concatenate([self.pushes, normals]) @ rotation)
         places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ rotation)
         f = len(self.force)
         sliding = torch.from_numpy(self._sliding(tips, points, normals))
@@ -143,11 +142,12 @@ class SimulatedHand:
 
     def _sliding(self, tips: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the speed [m/s] of each tip along the object's surface since the last tick; 0 without contact."""
-        poses, before = np.concatenate([tips, self.scene.object_pose()[None]]), self._poses
+        poses, before = np.array([*tips, self.scene.object_pose()]), self._poses
         self._poses = poses
         if before is None or np.isnan(points).all():
             return np.zeros(len(tips))
-        here = np.concatenate([points, np.ones((len(points), 1))], 1)
+        here = np.ones((len(points), 4))
+        here[:, :3] = points
         then = before @ np.linalg.inv(poses)
         on_tip, on_object = (then[:-1] @ here[:, :, None])[:, :3, 0], (here @ then[-1].T)[:, :3]
         moved = on_object - on_tip
