@@ -132,7 +132,7 @@ def measure(
         forces = forces - NOISE * push * along + tangential_noise * across[0]
         radii = radius.cpu().numpy()[:, None]
         curvature_radius = np.where(radii > 0, radii, 0.012)
-        normals = unit(torch.from_numpy(true_normals + place_noise / curvature_radius * across[1])).numpy()
+        normals = unit(torch.from_numpy(true_normals + place_noise * (1 / curvature_radius) * across[1])).numpy()
         points = points + curvature_radius * (true_normals - normals)
     average = average + low_pass(FLAG_CUTOFF, max(period, interval)) * (reading - average)
     contact = flag(tactile.contact.cpu().numpy(), average, 1.0 if generator is None else max(noise, 1.0))
