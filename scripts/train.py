@@ -8,6 +8,7 @@ python scripts/train.py paper_model allegro                       the posture mo
 python scripts/train.py success                                   the predicted success that ranks grasps
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
 python scripts/train.py bands DIR                                 how far off hidden sides are
+python scripts/train.py household DIR                             bodies of a household, with views, for any bench
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
 python scripts/train.py scene                                     the depth image of the shipped scene
 python scripts/train.py golden                                    grasps with known verdicts, for torchgrasp selftest
@@ -18,6 +19,7 @@ import sys
 import tyro
 from train.author_objects import golden, objects, scene
 from train.bands import bands
+from train.household import household
 from train.occupancy import occupancy
 from train.paper_model import paper_model
 from train.stability import stability
@@ -26,7 +28,7 @@ from train.success import success
 from torchgrasp.errors import GraspError
 
 if __name__ == "__main__":
-    commands = {x.__name__: x for x in (stability, paper_model, success, occupancy, bands, objects, scene, golden)}
+    commands = {x.__name__: x for x in (stability, paper_model, success, occupancy, bands, household, objects, scene, golden)}
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")
     except GraspError as error:

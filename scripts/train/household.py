@@ -7,10 +7,12 @@ by construction, and its mesh is their union. Nothing fitted on them has seen a 
 import dataclasses
 import itertools
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import trimesh
+import tyro
 
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import save_cloud
@@ -71,14 +73,22 @@ def draw_thing(k: int) -> tuple[str, Thing]:
     return family, turn(thing, "x", 90 if family in TOPPLED and draw() < LYING else 0)
 
 
-def write_household(folder: Path, count: int, first: int = 0) -> None:
+def household(
+    folder: tyro.conf.Positional[Path], count: int = 91, first: int = 0, highest: float = math.inf
+) -> None:
     """Write bodies as a folder of objects (`torchgrasp.data`) with one noisy view each.
 
     The corners of the parts lie beside each mesh, as those of the library's own objects (`torchgrasp.data.shipped`).
+
+    Args:
+        folder: where the bodies go.
+        count: number of bodies.
+        first: number of the first body.
+        highest: height [m] above which a body is left out.
     """
+    bodies = filter(lambda body: body.mesh.extents[2] <= highest, map(author_household, itertools.count(first)))
     entries = {}
-    for k in range(first, first + count):
-        body = author_household(k)
+    for k, body in enumerate(itertools.islice(bodies, count), first):
         home = folder / body.name
         camera = look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=body.mesh)
         corners = [np.asarray(part.vertices) for part in body.parts]

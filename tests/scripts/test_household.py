@@ -6,7 +6,7 @@ import trimesh
 
 pytest.importorskip("manifold3d")
 
-from train.household import FAMILIES, author_household, write_household
+from train.household import FAMILIES, author_household, household
 from train.solids import SECTORS, SIDES, find_rest, shell, stack, unite, vessel
 
 from torchgrasp.data import list_views, read_view
@@ -100,7 +100,7 @@ def test_a_tilted_box_comes_to_rest_on_its_nearest_steady_face():
 
 
 def test_a_folder_of_bodies_reads_back_with_view_and_parts(tmp_path):
-    write_household(tmp_path, 1, first=5)
+    household(tmp_path, 1, first=5)
     body = author_household(5)
     assert list_views(tmp_path) == [(body.name, "view0")] and len(read_view(tmp_path, body.name, "view0")) > 100
     assert read_mesh(tmp_path / body.name / "mesh.ply").volume == pytest.approx(body.mesh.volume, rel=1e-4)
