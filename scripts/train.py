@@ -9,6 +9,7 @@ python scripts/train.py success                                   the predicted 
 python scripts/train.py occupancy DIR                             how likely hidden places of a scene are full
 python scripts/train.py bands DIR                                 how far off hidden sides are
 python scripts/train.py household DIR                             bodies of a household, with views, for any bench
+python scripts/train.py trials DIR                                grasps on these bodies, each tried with its own task
 python scripts/train.py objects                                   meshes, convex parts and views of the own objects
 python scripts/train.py scene                                     the depth image of the shipped scene
 python scripts/train.py golden                                    grasps with known verdicts, for torchgrasp selftest
@@ -24,11 +25,15 @@ from train.occupancy import occupancy
 from train.paper_model import paper_model
 from train.stability import stability
 from train.success import success
+from train.trials import trials
 
 from torchgrasp.errors import GraspError
 
 if __name__ == "__main__":
-    commands = {x.__name__: x for x in (stability, paper_model, success, occupancy, bands, household, objects, scene, golden)}
+    commands = {
+        x.__name__: x
+        for x in (stability, paper_model, success, occupancy, bands, household, trials, objects, scene, golden)
+    }
     try:
         tyro.extras.subcommand_cli_from_dict(commands, prog="train.py", description="Files that torchgrasp ships.")
     except GraspError as error:

@@ -73,9 +73,7 @@ def draw_thing(k: int) -> tuple[str, Thing]:
     return family, turn(thing, "x", 90 if family in TOPPLED and draw() < LYING else 0)
 
 
-def household(
-    folder: tyro.conf.Positional[Path], count: int = 91, first: int = 0, highest: float = math.inf
-) -> None:
+def household(folder: tyro.conf.Positional[Path], count: int = 91, first: int = 0, highest: float = math.inf) -> None:
     """Write bodies as a folder of objects (`torchgrasp.data`) with one noisy view each.
 
     The corners of the parts lie beside each mesh, as those of the library's own objects (`torchgrasp.data.shipped`).

@@ -1,0 +1,195 @@
+"""Trials of the predicted success: grasps of all ranks on authored household bodies, each tried with a task of its own.
+
+One job is one body and one hand. It is planned on from a noisy view and its grasps are tried in MuJoCo. The jobs of a
+hand are a campaign (`torchgrasp.campaign`): the same call continues an interrupted run. Tasks are kept as metadata.
+"""
+
+import dataclasses
+import json
+from collections.abc import Generator, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import tyro
+from tqdm import tqdm
+
+from torchgrasp.campaign.cluster import empty_shard, run_on_cluster, versions
+from torchgrasp.campaign.folder import README, Campaign, carry_out
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.data.reader import GraspShards
+from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
+from torchgrasp.errors import GraspError, Status
+from torchgrasp.evaluation.protocols import draw_error, seed_of
+from torchgrasp.evaluation.pull import run_protocol
+from torchgrasp.evaluation.trial import GraspTrial, Truth
+from torchgrasp.files import write_file
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
+from torchgrasp.jobs import run_as_they_end
+from torchgrasp.planner import plan_grasps
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.surface import surface_field
+from torchgrasp.specs import ContactSpec
+from torchgrasp.values import Grasps, PointCloud
+from train.household import HouseholdBody, author_household
+from train.tasks import FRICTION, PULL, Task, draw_task
+
+HANDS = ("allegro", "barrett", "leap", "shadow")
+"""Hands of the trials; each body is tried with one of them."""
+
+SENSORS = (True, "realsense", "kinect_v1", "azure", "zivid")
+"""Noise of the views."""
+
+STARTS, BEST, SPREAD = 400, 6, 6
+"""Random starts of the planner; grasps tried of the twenty best ones, and of those that follow."""
+
+LIMIT = 1800.0
+"""Wall time [s] of one job."""
+
+
+ABOUT = """---
+license: mit
+---
+# Grasps of the {hand} hand on household bodies, each tried with a task of its own
+
+{counts[tries]} trials of {counts[objects]} bodies of {counts[families]} families; {counts[passed]} passed.
+`scripts/train.py trials` makes them. A job is one noisy view of one body, planned on from {starts} starts. {best} of
+its twenty best grasps and {more} others are tried in MuJoCo. `read_rows` of `train/trials.py` reads jobs with their
+tasks: friction, mass, force, protocol and displacement.
+
+Made with {versions}.
+"""
+
+
+class Trial(NamedTuple):
+    """One row of the data: a grasp of a body, its rank, its task, and what became of it."""
+
+    body: str
+    family: str
+    rank: int
+    task: Task
+    passed: bool
+    status: Status
+
+
+def trials(
+    folder: tyro.conf.Positional[Path], bodies: int = 1820, workers: int | str = 1, hands: tuple[str, ...] = HANDS
+) -> None:
+    """Try grasps of all hands on household bodies; what is in the folder is not run again.
+
+    Args:
+        folder: of the data sets, one for each hand.
+        bodies: number of bodies; they are shared among the hands.
+        workers: number of processes, or the address of a Dask scheduler.
+        hands: whose share is tried.
+    """
+    for hand in hands:
+        counts = run_trials(hand, bodies, folder, workers).card["counts"]
+        print(f"{hand}: {counts['tries']} trials on {counts['objects']} bodies, {counts['passed']} passed")
+
+
+def run_trials(hand: str, bodies: int, folder: Path, workers: int | str = 1, seed: int = 0) -> GraspShards:
+    """Try grasps of one hand on its share of the first bodies, and return the data set."""
+    numbers = range(HANDS.index(hand), bodies, len(HANDS))
+    model, about = load_hand(hand), {"name": hand, "option": load_hand(hand).source.option}
+    about |= {"sha256": model.source.sha256, "joint_names": ", ".join(model.joint_names)}
+    about["finger_names"] = ", ".join(model.finger_names)
+    trials = {"grasps": BEST + SPREAD, "ranks": "best and spread", "starts": STARTS, "seed": seed}
+    asked = {
+        "torchgrasp": "campaign", "version": 1, "licence": "MIT", "hand": about, "trials": trials,
+        "protocol": dataclasses.asdict(PULL), "tasks": "drawn for each trial: train/tasks.py", "bodies": len(numbers),
+        "jobs_in_shard": 32, "versions": versions(),
+    }  # fmt: skip
+    rows = tuple(JobRow(f"body{k:05d}", "view0") for k in numbers)
+    campaign = Campaign(asked, rows, lambda row: empty_shard(row, model, 1))
+
+    def work(places: Sequence[int]) -> Generator[tuple[int, bytes | Status], None, None]:
+        tasks = [(hand, numbers[place], seed, campaign.meta) for place in places]
+        run = run_on_cluster if isinstance(workers, str) else run_as_they_end
+        return run(try_body, tasks, workers, LIMIT)  # pyright: ignore[reportArgumentType]
+
+    with tqdm(total=len(rows), disable=None) as bar:
+        data = carry_out(campaign, folder / hand, work, lambda _: bar.update())
+    counts = data.card["counts"]
+    about = ABOUT.format(
+        hand=hand, counts=counts, versions=json.dumps(versions()), starts=STARTS, best=BEST, more=SPREAD
+    )
+    write_file(folder / hand / README, about)
+    return data
+
+
+def try_body(hand: str, k: int, seed: int, meta: dict[str, str]) -> bytes:
+    """Plan on one view of a body, try its grasps, and return the bytes of a shard with this job alone."""
+    torch.set_num_threads(1)
+    model, body = load_hand(hand), author_household(k)
+    draw = np.random.default_rng([seed, k])
+    row = JobRow(f"body{k:05d}", "view0", family=body.family)
+    try:
+        shard = _try_body(model, body, draw, row, seed_of(seed, k))
+    except GraspError as error:  # as a body that the camera does not see
+        row = row._replace(status=Status.BAD_OBJECT, note=short(f"{type(error).__name__}: {error}"))
+        shard = empty_shard(row, model, 1)
+    return pack_shard(shard, meta)
+
+
+def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: JobRow, seed: int) -> Shard:
+    azimuth, elevation = draw.uniform(0.0, 360.0), draw.uniform(15.0, 60.0)
+    sensor, friction = SENSORS[draw.integers(len(SENSORS))], round(float(draw.uniform(*FRICTION)), 3)
+    camera = look_at(azimuth, elevation, target=body.mesh)
+    cloud, table = partial_view(body.mesh, camera, noise=sensor, seed=seed), Plane.horizontal(0.0)  # pyright: ignore[reportArgumentType]
+    found = plan_grasps(cloud, hand, ContactSpec(friction=friction, table=table), STARTS)
+    executable = found[found.status == Status.OK]
+    row = row._replace(executable=len(executable), points=len(cloud), meta={"sensor": str(sensor)})
+    if not len(executable):
+        row = row._replace(status=Status(int(found.status.mode().values)) if len(found) else Status.OUT_OF_REACH)
+        empty = empty_shard(row, hand, 1).records
+        return Shard((row,), dataclasses.replace(empty, points=cloud.points.double(), viewpoints=_eye(cloud)))
+    ranks = choose_ranks(len(executable), draw)
+    surface, tasks, results = surface_field(fit_shape(cloud, table=table)), [], []
+    for rank in ranks:
+        grasp, own = executable[rank], seed_of(seed, rank)
+        tasks.append(draw_task(draw, friction))
+        error = draw_error(tasks[-1].protocol, grasp, body.mesh, own)
+        truth = Truth(body.mesh, body.parts, error)
+        trial = GraspTrial(hand, grasp, truth, seed_of(own, "touch"), surface=surface if tasks[-1].lift else None)
+        results.append(run_protocol(trial, tasks[-1].protocol, rank))
+    passed = torch.tensor([[x.passed] for x in results])
+    outcome = torch.tensor([[int(x.status)] for x in results])
+    said = json.dumps([dataclasses.asdict(task) for task in tasks])
+    meta = executable.meta | row.meta | {"tasks": said, "ranks": json.dumps(ranks), "friction": str(friction)}
+    row = row._replace(grasps=len(ranks), passed=int(passed.sum()), meta=meta)
+    return Shard((row,), Records(cloud.points.double(), _eye(cloud), executable[ranks], passed, outcome))
+
+
+def choose_ranks(executable: int, draw: np.random.Generator) -> list[int]:
+    """Return the ranks that are tried: some of the twenty best, and some of the others; at most all.
+
+    >>> choose_ranks(3, np.random.default_rng(0))
+    [0, 1, 2]
+    """
+    best, others = np.arange(min(20, executable)), np.arange(20, executable)
+    few = [draw.permutation(rows)[:most] for rows, most in ((best, BEST), (others, SPREAD))]
+    return sorted(int(x) for x in np.concatenate(few))
+
+
+def read_rows(data: GraspShards) -> Iterator[tuple[JobRow, PointCloud, Grasps, list[Trial]]]:
+    """Yield each job with grasps: its row, cloud, grasps, and its trials."""
+    for k, row in enumerate(data.jobs):
+        if not row.grasps:
+            continue
+        job = data.job(k)
+        said: list[dict[str, Any]] = json.loads(job.row.meta["tasks"])
+        ranks, tasks = json.loads(job.row.meta["ranks"]), [Task.read(fields) for fields in said]
+        trials = [
+            Trial(row.object, row.family, rank, task, bool(passed), Status(int(status)))
+            for rank, task, passed, status in zip(ranks, tasks, job.passed[:, 0], job.outcome[:, 0], strict=True)
+        ]
+        yield job.row, job.cloud, job.grasps, trials
+
+
+def _eye(cloud: PointCloud) -> torch.Tensor:
+    """Return the camera's position (1, 3) [m]; zeros without one."""
+    return torch.zeros(1, 3, dtype=torch.float64) if cloud.viewpoint is None else cloud.viewpoint.double()[None]

@@ -1,0 +1,58 @@
+"""Trials of the predicted success: tasks are drawn within bounds, ranks are of both ends, jobs are the same again."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("manifold3d")
+pytest.importorskip("mujoco")
+
+from train import trials as runner
+from train.tasks import FORCE, FRICTION, MASS, Task, draw_task
+from train.trials import choose_ranks, read_rows, run_trials
+
+from torchgrasp.errors import Status
+
+
+def test_tasks_lie_within_their_bounds_and_half_keep_the_planned_friction():
+    draw = np.random.default_rng(0)
+    tasks = [draw_task(draw, 0.9) for _ in range(400)]
+    assert all(FRICTION[0] <= x.friction <= FRICTION[1] and MASS[0] <= x.mass <= MASS[1] for x in tasks)
+    assert all(x.lift or x.force is not None for x in tasks)  # a pulled object weighs nothing that a hand may feel
+    assert all(x.force is None or FORCE[0] <= x.force <= FORCE[1] for x in tasks)
+    for share in (x.friction == 0.9 for x in tasks), (x.lift for x in tasks), (x.aside > 0 for x in tasks):
+        assert 0.4 < np.mean(list(share)) < 0.6
+
+
+def test_a_task_says_what_its_trial_is():
+    lift, pull = Task(True, "uncertainty", 0.6, 0.3, None, 0.02), Task(False, "open_loop", 0.4, 0.05, 5.0, 0.0)
+    trial = lift.protocol.trial
+    assert (trial.mass, trial.friction, trial.table_friction, trial.pressing) == (0.3, 0.6, 0.15, "grip")
+    assert (lift.protocol.criterion, lift.protocol.tries, lift.protocol.noise.translation) == ("held", 1, 0.02)
+    trial = pull.protocol.trial
+    assert (trial.force, trial.closing, trial.gravity, trial.simulator) == (5.0, "open_loop", 0.0, "mujoco")
+    assert trial.friction * trial.patch == pytest.approx(0.02)
+
+
+def test_ranks_are_of_the_best_and_of_the_rest():
+    ranks = choose_ranks(100, np.random.default_rng(1))
+    assert ranks == sorted(set(ranks)) and sum(rank < 20 for rank in ranks) == runner.BEST
+    assert len(ranks) == runner.BEST + runner.SPREAD and max(ranks) < 100
+
+
+@pytest.mark.sim
+def test_trials_are_kept_and_read_with_their_tasks(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "STARTS", 20)
+    monkeypatch.setattr(runner, "BEST", 1)
+    monkeypatch.setattr(runner, "SPREAD", 0)
+    data = run_trials("allegro", 1, tmp_path, 0)
+    [(row, cloud, grasps, [trial])] = read_rows(data)
+    assert (row.object, row.status, trial.status in Status) == ("body00000", Status.OK, True)
+    assert len(cloud) == row.points and len(grasps) == 1 and trial.rank < 20
+    assert json.loads(grasps.meta["ranks"]) == [trial.rank]
+    again = run_trials("allegro", 1, tmp_path / "again", 0)
+    assert (tmp_path / "again" / "allegro" / "shard-000000.safetensors").read_bytes() == (
+        tmp_path / "allegro" / "shard-000000.safetensors"
+    ).read_bytes()
+    assert again.card["counts"] == data.card["counts"]
