@@ -1,7 +1,4 @@
-"""Round and hollow things of a household: solids of revolution, and vessels with thin walls. Lengths are in mm.
-
-Each function makes one body of its family; `draw` draws its sizes. Upright things stand, long ones lie.
-"""
+"""Round and hollow things of a household: solids of revolution, and vessels with thin walls. Lengths are in mm."""
 
 import math
 
@@ -23,7 +20,7 @@ from train.solids import (
     stack,
     turn,
     vessel,
-)
+)  # fmt: skip
 
 
 def can(draw: Draw) -> Thing:

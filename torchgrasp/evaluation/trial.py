@@ -22,10 +22,10 @@ from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.control.relook import REACH
 from torchgrasp.errors import BadArgument
+from torchgrasp.evaluation.frame import moved_mesh, rounded, to_frame, world_frame
 from torchgrasp.evaluation.protocols import apply_error, seed_of
-from torchgrasp.geometry.frames import inverse, rigid
-from torchgrasp.geometry.linalg import unit
-from torchgrasp.geometry.plane import GRID, Plane, to_upright
+from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.convex_parts import read_solid
@@ -91,10 +91,10 @@ class TrialDriver:
         told, pose = trial.grasp.table if trial.told is None else trial.told, planned.obj_from_hand[0]
         if trial.truth.table is not None:
             self.obj_from_world = world_frame(trial.truth.table, pose)
-            grasp, known = _to_frame(planned, self.obj_from_world), _to_frame(planned, pose)
+            grasp, known = to_frame(planned, self.obj_from_world), to_frame(planned, pose)
             if told is not None:
                 told = told.moved(inverse(pose))
-                told = Plane(_rounded(told.normal), round(told.offset, 9))
+                told = Plane(rounded(told.normal), round(told.offset, 9))
         if reference is None:
             reference = derive_reference(
                 hand, known, told if spec.table else None, trial.surface, spec.closing, spec.strongest, spec.kp,
@@ -133,7 +133,7 @@ class TrialDriver:
         if mass is None:
             mass = self.spec.mass if self.spec.density is None else self.spec.density * float(mesh.volume)
         if self.trial.truth.table is not None:
-            mesh, *parts = (_moved(x, self.obj_from_world) for x in (mesh, *parts))
+            mesh, *parts = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
         return Body(mesh, parts, mass)
 
     def open(self) -> "TrialRun":
@@ -261,45 +261,6 @@ class TrialRun:
 def smooth_step(time: float) -> tuple[float, float]:
     """Return position and speed, at a `time` in [0, 1], of a motion from 0 to 1 that starts and ends at rest."""
     return time * time * (3 - 2 * time), 6 * time * (1 - time)
-
-
-def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return the pose of the simulator's frame in the frame of the grasp.
-
-    The table is at z = 0, the hand above the origin. The x axis is along the hand's x axis, or along the hand's y axis
-    if the former is steeper than 60 degrees.
-    """
-    z, origin = unit(table.normal.double()), obj_from_hand[:3, 3]
-    level = [axis - (axis @ z) * z for axis in obj_from_hand[:3, :2].unbind(-1)]
-    x = unit(level[0] if torch.linalg.vector_norm(level[0]) > 0.5 else level[1])
-    return rigid(torch.stack([x, torch.linalg.cross(z, x), z], -1), origin - table.height(origin) * z)
-
-
-def _to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
-    """Return a grasp, converted to another frame, with rounded numbers."""
-    frame_from_obj = inverse(obj_from_frame)
-
-    def turn(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        return _rounded(vectors @ frame_from_obj[:3, :3].T)
-
-    contacts = dataclasses.replace(
-        grasp.contacts, points=to_upright(grasp.contacts.points, obj_from_frame), normals=turn(grasp.contacts.normals)
-    )
-    pose = _rounded(frame_from_obj @ grasp.obj_from_hand)
-    return dataclasses.replace(grasp, contacts=contacts, obj_from_hand=pose, approach=turn(grasp.approach))
-
-
-def _rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round numbers of about size 1 to multiples of a billionth."""
-    return torch.round(numbers / GRID**1.5) * GRID**1.5
-
-
-def _moved(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
-    """Return a mesh, converted to the simulator's frame, with vertices rounded to multiples of `GRID`."""
-    import trimesh
-
-    vertices = to_upright(torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)), obj_from_world)
-    return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)
 
 
 def _by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:

@@ -21,7 +21,7 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vect
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.sim.convex_parts import convex_parts, hull
-from torchgrasp.sim.sapien_scene import import_sapien, open_world, place, rigid_body, table
+from torchgrasp.sim.sapien_bodies import import_sapien, open_world, place, rigid_body, table
 from torchgrasp.sim.scene_spec import Body
 from torchgrasp.specs import TrialSpec
 

@@ -1,0 +1,129 @@
+"""What a scene in SAPIEN is made of: the world, the table, bodies of convex parts, and the hand on its mount.
+
+Settings that differ from SAPIEN's defaults:
+
+* Joints get an armature (inertia of the motor): without it the implicit drives lose torque in a contact.
+* The hand's links feel no gravity, and collide with each other only in the pairs that the scene names.
+* Sleeping is off, because a sleeping body keeps stale contacts.
+* The object's inertia is set with its mass.
+* Penetrations are resolved at 1 m/s at most.
+* The solver is PGS: with TGS a held object creeps, far inside the friction cones. Only TGS knows contact patches; with
+  32 iterations a step the object creeps slower than with 10.
+* Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its own.
+"""
+
+import math
+import warnings
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from torchgrasp.errors import MissingExtra
+from torchgrasp.files import temporary_folder, write_file
+from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, mounted_urdf, pair_masks
+
+
+def open_world(sapien: Any, physx: Any, gravity: float, timestep: float, patches: bool = False) -> tuple[Any, Any]:
+    """Return an empty physics system and its scene, with given gravity [m/s^2] and timestep [s]."""
+    physx.set_scene_config(gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=patches, enable_pcm=True)
+    physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
+    physx.set_body_config(solver_position_iterations=32, solver_velocity_iterations=1, sleep_threshold=0.0)
+    system = physx.PhysxCpuSystem()
+    scene = sapien.Scene([system])
+    scene.timestep = timestep
+    return system, scene
+
+
+def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) -> None:
+    """Add an entity with one body to the scene, with the body's origin at a `height` [m] on the world's z axis."""
+    entity = sapien.Entity()
+    entity.name = name
+    entity.add_component(body)
+    entity.set_pose(sapien.Pose([0.0, 0.0, height]))
+    scene.add_entity(entity)
+
+
+def table(sapien: Any, physx: Any, material: Any) -> Any:
+    """Return the body of the table, a half space; on a box, a rocking object gains energy until it falls over."""
+    body, top = physx.PhysxRigidStaticComponent(), physx.PhysxCollisionShapePlane(material)
+    top.set_local_pose(sapien.Pose(q=[math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0]))  # its normal is its x axis
+    body.attach(top)
+    return body
+
+
+def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: float) -> Any:
+    """Return a dynamic body of uniform density, made of convex hulls; `patch` [m] is the radius of contact patches.
+
+    PhysX drops vertices within 0.7 mm of the hull of the others. Therefore it gets hulls a hundred times as large.
+    """
+    scale = 0.01
+    body = physx.PhysxRigidDynamicComponent()
+    for vertices in (some for hull in hulls for some in _split(hull)):
+        scaled = (vertices / scale).astype(np.float32)
+        shape = physx.PhysxCollisionShapeConvexMesh(scaled, np.full(3, scale, np.float32), material)
+        shape.min_patch_radius = patch
+        body.attach(shape)
+    moments, axes = np.linalg.eigh(spec.inertia)
+    axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = axes, spec.mesh.center_mass
+    body.mass = spec.mass
+    body.cmass_local_pose = sapien.Pose(frame)
+    body.inertia = moments.astype(np.float32)
+    body.max_depenetration_velocity = 1.0
+    body.linear_damping = body.angular_damping = 0.0
+    return body
+
+
+def _split(hull: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the vertices of a convex hull; then of its foot, a pyramid, if PhysX keeps not all vertices of the hull."""
+    most, lowest = 129, 100  # PhysX keeps 255 faces: as many as 129 vertices have
+    yield hull
+    if len(hull) > most:
+        yield np.vstack([hull[hull[:, 2].argsort(kind="stable")[:lowest]], hull.mean(0)])
+
+
+def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
+    """Load the hand on its mount, set it to its initial posture, and return it."""
+    loader = scene.create_urdf_loader()
+    loader.fix_root_link = True
+    loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
+    with temporary_folder() as folder:
+        hand = loader.load(str(write_file(folder / "hand.urdf", mounted_urdf(spec))))
+    slides = {slide.name: slide for slide in spec.slides}
+    spec.check_drives([j.name for j in hand.active_joints if j.name not in slides])
+    start = []
+    for joint in hand.active_joints:
+        joint.set_friction(0.0)
+        if joint.name in slides:
+            drive, position = MOUNT_DRIVE, slides[joint.name].start
+        else:
+            drive, position = spec.drives[joint.name], float(spec.joints[joint.name])
+            joint.set_armature(np.array([ARMATURE], np.float32))
+        joint.set_drive_properties(drive.kp, drive.kd, force_limit=drive.effort)
+        joint.set_drive_target(position)
+        start.append(position)
+    hand.set_qpos(np.array(start, np.float32))
+    everything_else = 1  # SAPIEN's default collision group, the first bit
+    masks = pair_masks(spec.self_pairs, first=1)
+    for link in hand.links:
+        link.disable_gravity = True
+        for shape in link.collision_shapes:
+            kind, hits = masks.get(link.name, (0, 0))
+            shape.set_collision_groups([kind, everything_else | hits, 0, 0])
+            if link.name in spec.tip_links:
+                shape.min_patch_radius = spec.patch
+    return hand
+
+
+def import_sapien() -> tuple[Any, Any]:
+    """Import and return SAPIEN and its physics; its warning about missing Vulkan, which physics can lack, is hidden."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import sapien
+            import sapien.physx as physx
+    except ImportError as error:
+        raise MissingExtra("sapien", "sim") from error
+    return sapien, physx
