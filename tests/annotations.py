@@ -1,6 +1,6 @@
-"""Annotations of every call are checked as jaxtyping does, in a fraction of its time.
+"""Annotations of every call are checked as jaxtyping does, without binding arguments, which takes most of its time.
 
-A function gets its check at its first call, and nested functions share one check. Shapes are compared without copies.
+A function gets its check at its first call, and nested functions share one check.
 """
 
 import dataclasses
@@ -9,16 +9,13 @@ import inspect
 import typing
 from collections.abc import Callable
 from types import CodeType, FunctionType, SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jaxtyping
-import torch
 from beartype import BeartypeConf, beartype
-from jaxtyping import _array_types as arrays
-from jaxtyping._storage import get_shape_memo, pop_shape_memo, push_shape_memo
-from torch import Tensor
+from jaxtyping._storage import pop_shape_memo, push_shape_memo
 
-by_jaxtyping, instance_by_jaxtyping = jaxtyping.jaxtyped, arrays._MetaAbstractArray.__instancecheck__
+by_jaxtyping = jaxtyping.jaxtyped
 CHECKS: dict[CodeType, FunctionType] = {}
 """A function with a check, by the code of the function."""
 
@@ -80,56 +77,6 @@ def resolved(hint: Any, names: dict[str, Any]) -> Any:
         return Any
 
 
-class Axes(NamedTuple):
-    """The axes of a tensor in an annotation: their sizes and letters."""
-
-    first: tuple[int | str, ...]
-    many: str | None
-    """The name of any number of axes between the first and the last ones."""
-    last: tuple[int | str, ...]
-
-
-@functools.cache
-def axes_of(hint: Any) -> Axes | None:
-    """Return the axes of an annotation; none if it has others than sizes and letters."""
-    fixed, named = arrays._FixedDim, arrays._NamedDim | arrays._NamedVariadicDim
-    for axis in hint.dims:
-        if not isinstance(axis, fixed | named) or axis.broadcastable or getattr(axis, "treepath", False):
-            return None
-    sizes, at = tuple(axis.size if isinstance(axis, fixed) else axis.name for axis in hint.dims), hint.index_variadic
-    return Axes(sizes, None, ()) if at is None else Axes(sizes[:at], sizes[at], sizes[at + 1 :])
-
-
-@functools.cache
-def takes(hint: Any, dtype: torch.dtype) -> bool:
-    """Return whether an annotation takes tensors of a type of numbers."""
-    number = torch.empty((), dtype=dtype, device="meta")
-    return issubclass(Tensor, hint.array_type) and instance_by_jaxtyping(hint.dtype[Tensor, "..."], number)
-
-
-def is_instance(hint: Any, value: Any) -> bool:
-    """Return whether a value fits an annotation, and bind its letters; jaxtyping decides in rare cases."""
-    axes = axes_of(hint)
-    if axes is None or not isinstance(value, Tensor) or not takes(hint, value.dtype):
-        return instance_by_jaxtyping(hint, value)
-    shape, (letters, shapes, *_) = tuple(value.shape), get_shape_memo()
-    first, many, last = axes
-    between = shape[len(first) : len(shape) - len(last)]
-    if len(shape) < len(first) + len(last) or (many is None and between):
-        return False
-    new: dict[int | str, int] = {}
-    for axis, size in zip(first + last, shape[: len(first)] + shape[len(first) + len(between) :], strict=True):
-        if axis != size and (isinstance(axis, int) or letters.get(axis, new.setdefault(axis, size)) != size):
-            return False
-    if many is not None and shapes.get(many, (False, between)) != (False, between):
-        return instance_by_jaxtyping(hint, value)
-    letters.update(new)
-    if many is not None:
-        shapes[many] = (False, between)
-    return True
-
-
 def install() -> None:
-    """Replace the decorator of jaxtyping and its check of shapes; the library is imported later."""
+    """Replace the decorator of jaxtyping; the library is imported later."""
     jaxtyping.jaxtyped = jaxtyped
-    arrays._MetaAbstractArray.__instancecheck__ = is_instance

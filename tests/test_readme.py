@@ -1,7 +1,5 @@
 """What README, guides and examples show runs; commands exist and take their flags."""
 
-import contextlib
-import io
 import json
 import os
 import re
@@ -36,14 +34,7 @@ def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     """A draft, its check, a mend by hand, a held object, a file for the robot; with fewer starts."""
     from torchgrasp.app import cli
 
-    def printed(code):
-        with contextlib.redirect_stdout(io.StringIO()) as out:
-            exec(code, {})
-        return out.getvalue().strip()
-
     def in_shell(line):
-        """Run a line of a shell, but Python in it here, where all is imported."""
-        line = re.sub(r"\$\(python -c '([^']*)'\)", lambda found: printed(found[1]), line)
         done = subprocess.run(["bash", "-euo", "pipefail", "-c", line], capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout.strip()

@@ -7,7 +7,7 @@ bowls. Sizes suit one hand. Each is seen from one side by the library's own came
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,11 @@ def author_folder(folder: Path) -> None:
     for kind, count in COUNTS.items():
         for k in range(count):
             solids[f"{kind}_{k}"] = author_body(kind, k)
+    write_bodies(folder, solids)
+
+
+def write_bodies(folder: Path, solids: Mapping[str, trimesh.Trimesh]) -> None:
+    """Write bodies by name, FAMILY_NUMBER, as a folder of objects with one noisy view each (`torchgrasp.data`)."""
     entries = {}
     for k, (name, mesh) in enumerate(solids.items()):
         mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])

@@ -6,7 +6,6 @@ by construction, and its mesh is their union. Nothing fitted on them has seen a 
 
 import dataclasses
 import itertools
-import json
 import math
 from pathlib import Path
 
@@ -14,10 +13,7 @@ import numpy as np
 import trimesh
 import tyro
 
-from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.cloud.read import save_cloud
-from torchgrasp.files import write_file
-from train.bodies import GOLDEN_ANGLE
+from train.bodies import write_bodies
 from train.forms import FORMS
 from train.implements import IMPLEMENTS
 from train.solids import Thing, find_rest, turn, unite
@@ -73,10 +69,10 @@ def draw_thing(k: int) -> tuple[str, Thing]:
     return family, turn(thing, "x", 90 if family in TOPPLED and draw() < LYING else 0)
 
 
-def household(folder: tyro.conf.Positional[Path], count: int = 91, first: int = 0, highest: float = math.inf) -> None:
+def household(
+    folder: tyro.conf.Positional[Path], count: int = len(FAMILIES), first: int = 0, highest: float = math.inf
+) -> None:
     """Write bodies as a folder of objects (`torchgrasp.data`) with one noisy view each.
-
-    The corners of the parts lie beside each mesh, as those of the library's own objects (`torchgrasp.data.shipped`).
 
     Args:
         folder: where the bodies go.
@@ -85,15 +81,4 @@ def household(folder: tyro.conf.Positional[Path], count: int = 91, first: int = 
         highest: height [m] above which a body is left out.
     """
     bodies = filter(lambda body: body.mesh.extents[2] <= highest, map(author_household, itertools.count(first)))
-    entries = {}
-    for k, body in enumerate(itertools.islice(bodies, count), first):
-        home = folder / body.name
-        camera = look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=body.mesh)
-        corners = [np.asarray(part.vertices) for part in body.parts]
-        arrays = {"corners": np.concatenate(corners), "counts": np.array([len(x) for x in corners])}
-        home.mkdir(parents=True, exist_ok=True)
-        write_file(home / "mesh.ply", body.mesh.export(file_type="ply"))
-        write_file(home / "parts.npz", lambda file, arrays=arrays: np.savez_compressed(file, **arrays))
-        save_cloud(partial_view(body.mesh, camera, seed=k), home / "view0_noisy.ply")
-        entries[body.name] = {"family": body.family, "views": {"view0": {"T_object_camera": camera.tolist()}}}
-    write_file(folder / "manifest.json", json.dumps({"objects": entries}))
+    write_bodies(folder, {body.name: body.mesh for body in itertools.islice(bodies, count)})

@@ -2,21 +2,22 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from torchgrasp.base import Value
 from torchgrasp.evaluation import PROTOCOLS, PoseNoise, Protocol
+from torchgrasp.evaluation.protocols import POSE_NOISE
+from torchgrasp.specs import ClosingMode
 
 FRICTION, MASS, FORCE = (0.2, 1.0), (0.02, 1.0), (2.0, 10.0)
 """Least and greatest friction, mass [kg] (even in its logarithm) and force [N] of the strongest finger."""
 
-ASIDE, TURNED = 0.03, math.radians(5)
-"""Greatest displacement [m] along each axis, and turn [rad] of a floating hand, of the half of trials that err."""
-
 PULL, LIFT = PROTOCOLS["dexgraspbench"], PROTOCOLS["table-lift"]
+
+ASIDE = PoseNoise(0.03)
+"""Greatest error of the place of a lifted object; a floating one errs as in protocol "pose-noise"."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,40 +27,35 @@ class Task(Value):
     Args:
         lift: whether the object is lifted off a table and held without slip; otherwise it floats and is pulled at.
         closing: "uncertainty" or "open_loop".
-        friction: at the fingertips, which the planner knows; that of the table is a quarter of it.
+        friction: at the fingertips; that of the table is in the same proportion to it as in protocol "table-lift".
         mass: of the object [kg]; the pulls press with 10 m/s^2 times the mass.
         force: of the strongest finger [N]; None: the hand grips as the felt load asks for.
-        aside: greatest error of the object's place [m].
+        errs: whether the object is not where the planner saw it.
     """
 
     lift: bool
-    closing: str
+    closing: ClosingMode
     friction: float
     mass: float
     force: float | None
-    aside: float
+    errs: bool
 
     @property
     def protocol(self) -> Protocol:
         """The protocol of the trial, in MuJoCo.
 
-        >>> Task(True, "uncertainty", 0.8, 0.25, None, 0.0).protocol.trial.table_friction
+        >>> Task(True, "uncertainty", 0.8, 0.25, None, False).protocol.trial.table_friction
         0.2
         """
+        base = LIFT if self.lift else PULL
+        error, trial = ASIDE if self.lift else POSE_NOISE, base.trial
         changes: dict[str, Any] = {"closing": self.closing, "friction": self.friction, "mass": self.mass}
-        if not self.lift:
-            noise = PoseNoise(self.aside / 6, TURNED if self.aside else 0.0)  # a floating object is seen from all sides
-            found = dataclasses.replace(PULL, noise=noise)
-            changes["patch"] = 0.02 / self.friction  # [m], DexGraspBench's
-        else:
-            found = dataclasses.replace(LIFT, noise=PoseNoise(self.aside), tries=1, criterion="held")
-            changes["table_friction"] = self.friction / 4
+        if trial.table_friction is not None:
+            changes["table_friction"] = trial.table_friction / trial.friction * self.friction
+        changes["patch"] = trial.patch * trial.friction / self.friction  # friction times patch resists torsion
+        noise = error if self.errs else PoseNoise()
+        found = dataclasses.replace(base, noise=noise, tries=1, criterion="held")
         return found.with_trial(**changes, force=self.force, simulator="mujoco")
-
-    @classmethod
-    def read(cls, fields: Mapping[str, Any]) -> "Task":
-        """Return a task, given its fields."""
-        return cls(**fields)
 
 
 def draw_task(draw: np.random.Generator, planned: float) -> Task:
@@ -72,7 +68,4 @@ def draw_task(draw: np.random.Generator, planned: float) -> Task:
     friction, force = (round(float(draw.uniform(*bounds)), 3) for bounds in (FRICTION, FORCE))
     mass = round(math.exp(draw.uniform(*np.log(MASS))), 4)
     closing = "uncertainty" if lift or draw.random() < 0.5 else "open_loop"
-    gripped = lift and grips
-    return Task(
-        bool(lift), closing, planned if kept else friction, mass, None if gripped else force, ASIDE if errs else 0.0
-    )
+    return Task(bool(lift), closing, planned if kept else friction, mass, None if lift and grips else force, bool(errs))

@@ -15,9 +15,10 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from torchgrasp.campaign.cluster import empty_shard, run_on_cluster, versions
+from torchgrasp.campaign.cluster import check_versions, empty_shard, run_on_cluster, versions
 from torchgrasp.campaign.folder import README, Campaign, carry_out
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.sensor import SensorName
 from torchgrasp.data.reader import GraspShards
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
 from torchgrasp.errors import GraspError, Status
@@ -34,13 +35,13 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud
-from train.household import HouseholdBody, author_household
+from train.household import FAMILIES, HouseholdBody, author_household
 from train.tasks import FRICTION, PULL, Task, draw_task
 
 HANDS = ("allegro", "barrett", "leap", "shadow")
 """Hands of the trials; each body is tried with one of them."""
 
-SENSORS = (True, "realsense", "kinect_v1", "azure", "zivid")
+SENSORS: tuple[bool | SensorName, ...] = (True, "realsense", "kinect_v1", "azure", "zivid")
 """Noise of the views."""
 
 STARTS, BEST, SPREAD = 400, 6, 6
@@ -58,7 +59,7 @@ license: mit
 {counts[tries]} trials of {counts[objects]} bodies of {counts[families]} families; {counts[passed]} passed.
 `scripts/train.py trials` makes them. A job is one noisy view of one body, planned on from {starts} starts. {best} of
 its twenty best grasps and {more} others are tried in MuJoCo. `read_rows` of `train/trials.py` reads jobs with their
-tasks: friction, mass, force, protocol and displacement.
+tasks: friction, mass, force, protocol, and whether the object is elsewhere.
 
 Made with {versions}.
 """
@@ -76,7 +77,10 @@ class Trial(NamedTuple):
 
 
 def trials(
-    folder: tyro.conf.Positional[Path], bodies: int = 1820, workers: int | str = 1, hands: tuple[str, ...] = HANDS
+    folder: tyro.conf.Positional[Path],
+    bodies: int = 20 * len(FAMILIES),
+    workers: int | str = 1,
+    hands: tuple[str, ...] = HANDS,
 ) -> None:
     """Try grasps of all hands on household bodies; what is in the folder is not run again.
 
@@ -94,12 +98,12 @@ def trials(
 def run_trials(hand: str, bodies: int, folder: Path, workers: int | str = 1, seed: int = 0) -> GraspShards:
     """Try grasps of one hand on its share of the first bodies, and return the data set."""
     numbers = range(HANDS.index(hand), bodies, len(HANDS))
-    model, about = load_hand(hand), {"name": hand, "option": load_hand(hand).source.option}
-    about |= {"sha256": model.source.sha256, "joint_names": ", ".join(model.joint_names)}
-    about["finger_names"] = ", ".join(model.finger_names)
+    model = load_hand(hand)
+    of_hand = {"name": hand, "option": model.source.option, "sha256": model.source.sha256}
+    of_hand |= {"joint_names": ", ".join(model.joint_names), "finger_names": ", ".join(model.finger_names)}
     trials = {"grasps": BEST + SPREAD, "ranks": "best and spread", "starts": STARTS, "seed": seed}
     asked = {
-        "torchgrasp": "campaign", "version": 1, "licence": "MIT", "hand": about, "trials": trials,
+        "torchgrasp": "campaign", "version": 1, "licence": "MIT", "hand": of_hand, "trials": trials,
         "protocol": dataclasses.asdict(PULL), "tasks": "drawn for each trial: train/tasks.py", "bodies": len(numbers),
         "jobs_in_shard": 32, "versions": versions(),
     }  # fmt: skip
@@ -123,7 +127,7 @@ def run_trials(hand: str, bodies: int, folder: Path, workers: int | str = 1, see
 
 def try_body(hand: str, k: int, seed: int, meta: dict[str, str]) -> bytes:
     """Plan on one view of a body, try its grasps, and return the bytes of a shard with this job alone."""
-    torch.set_num_threads(1)
+    check_versions(meta)
     model, body = load_hand(hand), author_household(k)
     draw = np.random.default_rng([seed, k])
     row = JobRow(f"body{k:05d}", "view0", family=body.family)
@@ -139,14 +143,15 @@ def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: J
     azimuth, elevation = draw.uniform(0.0, 360.0), draw.uniform(15.0, 60.0)
     sensor, friction = SENSORS[draw.integers(len(SENSORS))], round(float(draw.uniform(*FRICTION)), 3)
     camera = look_at(azimuth, elevation, target=body.mesh)
-    cloud, table = partial_view(body.mesh, camera, noise=sensor, seed=seed), Plane.horizontal(0.0)  # pyright: ignore[reportArgumentType]
+    cloud, table = partial_view(body.mesh, camera, noise=sensor, seed=seed), Plane.horizontal(0.0)
+    eye = cloud.viewpoint.double()[None]  # pyright: ignore[reportOptionalMemberAccess]
     found = plan_grasps(cloud, hand, ContactSpec(friction=friction, table=table), STARTS)
     executable = found[found.status == Status.OK]
     row = row._replace(executable=len(executable), points=len(cloud), meta={"sensor": str(sensor)})
     if not len(executable):
         row = row._replace(status=Status(int(found.status.mode().values)) if len(found) else Status.OUT_OF_REACH)
         empty = empty_shard(row, hand, 1).records
-        return Shard((row,), dataclasses.replace(empty, points=cloud.points.double(), viewpoints=_eye(cloud)))
+        return Shard((row,), dataclasses.replace(empty, points=cloud.points.double(), viewpoints=eye))
     ranks = choose_ranks(len(executable), draw)
     surface, tasks, results = surface_field(fit_shape(cloud, table=table)), [], []
     for rank in ranks:
@@ -161,7 +166,7 @@ def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: J
     said = json.dumps([dataclasses.asdict(task) for task in tasks])
     meta = executable.meta | row.meta | {"tasks": said, "ranks": json.dumps(ranks), "friction": str(friction)}
     row = row._replace(grasps=len(ranks), passed=int(passed.sum()), meta=meta)
-    return Shard((row,), Records(cloud.points.double(), _eye(cloud), executable[ranks], passed, outcome))
+    return Shard((row,), Records(cloud.points.double(), eye, executable[ranks], passed, outcome))
 
 
 def choose_ranks(executable: int, draw: np.random.Generator) -> list[int]:
@@ -182,14 +187,9 @@ def read_rows(data: GraspShards) -> Iterator[tuple[JobRow, PointCloud, Grasps, l
             continue
         job = data.job(k)
         said: list[dict[str, Any]] = json.loads(job.row.meta["tasks"])
-        ranks, tasks = json.loads(job.row.meta["ranks"]), [Task.read(fields) for fields in said]
+        ranks, tasks = json.loads(job.row.meta["ranks"]), [Task(**fields) for fields in said]
         trials = [
             Trial(row.object, row.family, rank, task, bool(passed), Status(int(status)))
             for rank, task, passed, status in zip(ranks, tasks, job.passed[:, 0], job.outcome[:, 0], strict=True)
         ]
         yield job.row, job.cloud, job.grasps, trials
-
-
-def _eye(cloud: PointCloud) -> torch.Tensor:
-    """Return the camera's position (1, 3) [m]; zeros without one."""
-    return torch.zeros(1, 3, dtype=torch.float64) if cloud.viewpoint is None else cloud.viewpoint.double()[None]

@@ -21,18 +21,20 @@ def test_tasks_lie_within_their_bounds_and_half_keep_the_planned_friction():
     assert all(FRICTION[0] <= x.friction <= FRICTION[1] and MASS[0] <= x.mass <= MASS[1] for x in tasks)
     assert all(x.lift or x.force is not None for x in tasks)  # a pulled object weighs nothing that a hand may feel
     assert all(x.force is None or FORCE[0] <= x.force <= FORCE[1] for x in tasks)
-    for share in (x.friction == 0.9 for x in tasks), (x.lift for x in tasks), (x.aside > 0 for x in tasks):
+    for share in (x.friction == 0.9 for x in tasks), (x.lift for x in tasks), (x.errs for x in tasks):
         assert 0.4 < np.mean(list(share)) < 0.6
 
 
 def test_a_task_says_what_its_trial_is():
-    lift, pull = Task(True, "uncertainty", 0.6, 0.3, None, 0.02), Task(False, "open_loop", 0.4, 0.05, 5.0, 0.0)
+    lift, pull = Task(True, "uncertainty", 0.6, 0.3, None, True), Task(False, "open_loop", 0.4, 0.05, 5.0, True)
     trial = lift.protocol.trial
-    assert (trial.mass, trial.friction, trial.table_friction, trial.pressing) == (0.3, 0.6, 0.15, "grip")
-    assert (lift.protocol.criterion, lift.protocol.tries, lift.protocol.noise.translation) == ("held", 1, 0.02)
+    assert (trial.mass, trial.friction, trial.patch, trial.pressing) == (0.3, 0.6, 0.0, "grip")
+    assert trial.table_friction == pytest.approx(0.15)
+    assert (lift.protocol.criterion, lift.protocol.tries, lift.protocol.noise.translation) == ("held", 1, 0.03)
     trial = pull.protocol.trial
     assert (trial.force, trial.closing, trial.gravity, trial.simulator) == (5.0, "open_loop", 0.0, "mujoco")
     assert trial.friction * trial.patch == pytest.approx(0.02)
+    assert pull.protocol.noise.translation == 0.005
 
 
 def test_ranks_are_of_the_best_and_of_the_rest():

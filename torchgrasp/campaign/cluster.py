@@ -36,6 +36,12 @@ def versions() -> dict[str, str]:
     return found
 
 
+def check_versions(meta: dict[str, str]) -> None:
+    """Raise `BadArgument` unless this machine has the software of the machine that began the campaign."""
+    if (here := json.dumps(versions())) != meta["versions"]:
+        raise BadArgument("workers", f"one with {here}", f"workers with {meta['versions']}")
+
+
 def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str]) -> bytes:
     """Plan and try the grasps of one job; return the bytes of a shard file that holds only this job.
 
@@ -43,9 +49,8 @@ def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str
     `versions` of the software. A faulty object gives a row with the reason. Errors that are not the object's fault are
     raised.
     """
-    hand, here = view.load_hand(), json.dumps(versions())
-    if here != meta["versions"]:
-        raise BadArgument("workers", f"one with {here}", f"workers with {meta['versions']}")
+    check_versions(meta)
+    hand = view.load_hand()
     if hand.source.sha256 != view.hand.sha256:
         raise BadArgument("hand", f"{view.hand.urdf_path} with other files", "the same hand on every machine")
     try:

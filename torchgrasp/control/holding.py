@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.least_forces import Balance, LeastForces, balance, cross_matrix, friction_ratios, lengths
+from torchgrasp.control.least_forces import Balance, LeastForces, balance, friction_ratios
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, low_pass
 from torchgrasp.errors import Status
@@ -158,7 +158,7 @@ class GripHold:
         wanted = self.solver.solve(contacts, self.normals, jacobian, self.load, self.aim, floor, reserve)
         self._judge(wanted, jacobian, period)
         step = self._command(contacts, wanted, period) - self.sent
-        length = np.maximum(lengths(step), 1e-9)[:, None]
+        length = np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-9)
         self.sent = self.sent + step * np.minimum(1.0, fastest_rise * period / length)
         self.sent /= max(1.0, self.solver.share(self.sent, self.normals, jacobian))
         torque = np.einsum("cij,ci->j", jacobian, self.sent)
@@ -174,7 +174,7 @@ class GripHold:
         """Filter the sensed forces, load and normals; return the contacts' grasp map and each finger's reserve [N]."""
         normals = _sensed(observation, self.normals)
         self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
-        self.normals /= lengths(self.normals)[:, None]
+        self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
         points = observation.tips.numpy() - self.radius[:, None] * self.normals
         touching, forces = observation.tactile.contact.numpy(), observation.tactile.forces.numpy()
         contacts = balance(points, touching)
@@ -240,7 +240,7 @@ class GripHold:
             self.trim = self.trim - period * 4.0 * lacking[:, None] * self.normals
             flat = self.trim.ravel()
             self.trim = (flat - contacts.inverse @ (contacts.wrench @ flat)).reshape(-1, 3)
-            largest, bound = (float(lengths(x).max()) for x in (self.trim, 0.5 * wanted))
+            largest, bound = (float(np.linalg.norm(x, axis=-1).max()) for x in (self.trim, 0.5 * wanted))
             self.trim = self.trim * min(1.0, bound / max(largest, 1e-9))
         missing = self.load - 0.8 * self.carried  # carrying all of it would press ever harder on a rigid table
         return wanted + self.trim - (contacts.inverse @ missing).reshape(-1, 3)
@@ -251,11 +251,11 @@ def push_reserve(contacts: Balance, normals: np.ndarray, arm: np.ndarray, fricti
 
     The push acts at `arm` [m] from the middle of the contacts. The fingers share it like springs of equal stiffness.
     """
-    pushes = np.concatenate([np.eye(3), cross_matrix(arm)])
+    pushes = np.concatenate([np.eye(3), np.cross(arm, np.eye(3)).T])
     share = (contacts.inverse @ pushes).reshape(-1, 3, 3)
     along = np.einsum("fi,fij->fj", normals, share)
     across = share - normals[:, :, None] * along[:, None]
-    return np.hypot(lengths(along), np.linalg.svd(across, compute_uv=False)[:, 0] / friction)
+    return np.hypot(np.linalg.norm(along, axis=-1), np.linalg.norm(across, ord=2, axis=(1, 2)) / friction)
 
 
 def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:

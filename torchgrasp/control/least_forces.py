@@ -17,14 +17,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from torchgrasp.geometry.frames import skew
+from torchgrasp.plan.forces import grasp_map
 
 Array = np.ndarray
 
 PENALTY, KNEE = 500.0, 0.9
 """Weight [N] of the penalty on joint torques and normal forces, and the share of their limits where it begins."""
-
-_AXES = skew(torch.eye(3, dtype=torch.float64)).reshape(3, 9).numpy()  # of the cross products with the axes
 
 
 class Balance(NamedTuple):
@@ -45,29 +43,16 @@ class Balance(NamedTuple):
 
 def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = True) -> Balance:
     """Return the grasp map at contact points [m] that touch, its pseudo-inverse and its null space, from one SVD."""
-    arms = points - torch.from_numpy(points).mean(0).numpy()  # NumPy sums five points in another order
-    wrench = np.empty((6, *arms.shape))
-    wrench[:3], wrench[3:] = np.eye(3)[:, None], cross_matrix(arms).transpose(1, 0, 2)
-    wrench = (wrench * np.reshape(touching, (-1, 1))).reshape(6, -1)
+    wrench = grasp_map(torch.from_numpy(points)).numpy() * np.repeat(np.broadcast_to(touching, len(points)), 3)
     left, values, right = np.linalg.svd(wrench)
     rank = int((values > 1e-12 * values[0]).sum())  # that of contacts on one line is 5
     return Balance(wrench, (right[:rank].T / values[:rank]) @ left[:, :rank].T, right[rank:].T)
 
 
-def cross_matrix(arms: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """Return the matrix of the cross product with each arm, as `skew` of `geometry.frames`."""
-    return (arms @ _AXES).reshape(*arms.shape, 3)
-
-
-def lengths(vectors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
-    """Return the lengths of vectors, sooner than `np.linalg.norm`."""
-    return np.sqrt((vectors * vectors).sum(-1))
-
-
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
     """Return each finger's ratio of tangential to normal force; the ratio is infinite if the finger does not press."""
     push = -(forces * normals).sum(-1)
-    slide = lengths(forces + push[:, None] * normals)
+    slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
     return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
 
 
@@ -80,8 +65,6 @@ class LeastForces:
 
     def __init__(self, start: Float[Array, "f 3"], effort: Float[Array, " j"], most: float) -> None:
         self.forces, self.start, self.effort, self.most = start, start, effort, most
-        self.growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # internal forces, if the load has grown
-        self.strides = 2.0 ** np.arange(8)  # multiples of a step that is safe for every self-concordant function
 
     def solve(
         self,
@@ -105,14 +88,16 @@ class LeastForces:
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], push])
         gap = 0.01 * (float(np.linalg.norm(load[:3])) + float(floor.sum()))  # distance from the cones beyond the noise
         barrier = _Barrier(contacts, normals, limits, load, gap, reserve)
-        tried = barrier.place(self.forces) + self.growth[:, None] * barrier.place(self.start, 0.0)
+        growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # added internal forces, if the load has grown
+        tried = barrier.place(self.forces) + growth[:, None] * barrier.place(self.start, 0.0)
         needed = 1.25 * float(friction_ratios(contacts.inner(self.start), normals).max())
         friction = max(friction, needed) if math.isfinite(needed) else friction
+        strides = 2.0 ** np.arange(8)  # multiples of a step that is safe for every self-concordant function
         with np.errstate(invalid="ignore", divide="ignore"):  # of logarithms outside the cones
             z = barrier.choose(tried, friction, floor)
             for _ in range(8 if math.isfinite(barrier.squared) else 0):  # no cone contains a finger that does not press
                 step, decrement = barrier.newton(z)
-                trial = z + np.minimum(self.strides / (1 + decrement), 1.0)[:, None] * step
+                trial = z + np.minimum(strides / (1 + decrement), 1.0)[:, None] * step
                 value = barrier.value(trial)
                 best = int(value.argmin())
                 if not math.isfinite(value[best]):

@@ -2,9 +2,8 @@
 
 import dataclasses
 import math
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -110,43 +109,39 @@ def measure(
     >>> felt.contact, felt.reading  # behind the low-pass
     (tensor([ True, False, False]), tensor([1.4308, 0.0000, 0.7154], dtype=torch.float64))
     """
-    device = tactile.lagged.device
-    check_device("truth", truth.forces.device, "the tactile state", device)
-    arrays = truth.normal_force, truth.forces, truth.points, truth.normals, tactile.lagged, tactile.average
-    push, forces, points, normals, lagged, average = (x.cpu().numpy() for x in arrays)  # small ones, faster in NumPy
-    sliding = np.zeros_like(push) if truth.sliding is None else truth.sliding.cpu().numpy()
-    sensed = np.concatenate([push[..., None], forces, sliding[..., None]], -1)
-    lagged = lagged + low_pass(20.0, period) * (sensed - lagged)
+    check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
+    sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
+    force = torch.cat([truth.normal_force[..., None], truth.forces, sliding[..., None]], dim=-1)
+    lagged = tactile.lagged + low_pass(20.0, period) * (force - tactile.lagged)
     age, interval = tactile.age + period, 1 / SAMPLING_RATE
     if age < interval - 1e-9:
-        return dataclasses.replace(tactile, lagged=torch.from_numpy(lagged).to(device), age=age)
+        return dataclasses.replace(tactile, lagged=lagged, age=age)
     reading, forces, sliding = lagged[..., 0], lagged[..., 1:4], lagged[..., 4]
+    points, normals = truth.points, truth.normals
     if generator is not None:
         place_noise, tangential_noise, slide_noise = 1.5e-3, 0.3, 2e-3  # [m, N, m/s]
-        along, true_normals = np.where(np.isfinite(normals), normals, pads.cpu().numpy()), normals
-        drawn = noise * torch.randn(2, *forces.shape, generator=generator, dtype=truth.forces.dtype).numpy()
-        normal_part = (drawn * along).sum(-1, keepdims=True)
+        along = torch.where(torch.isfinite(normals), normals, pads)
+        drawn = noise * torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
+        normal_part = (drawn * along).sum(-1, keepdim=True)
         push, across = normal_part[0], drawn - normal_part * along
         reading = reading + NOISE * push[..., 0]
         sliding = sliding + slide_noise * normal_part[1, ..., 0]
         forces = forces - NOISE * push * along + tangential_noise * across[0]
-        radii = radius.cpu().numpy()[:, None]
-        curvature_radius = np.where(radii > 0, radii, 0.012)
-        normals = unit(torch.from_numpy(true_normals + place_noise * (1 / curvature_radius) * across[1])).numpy()
-        points = points + curvature_radius * (true_normals - normals)
-    average = average + low_pass(FLAG_CUTOFF, max(period, interval)) * (reading - average)
-    contact = flag(tactile.contact.cpu().numpy(), average, 1.0 if generator is None else max(noise, 1.0))
+        curvature_radius = torch.where(radius > 0, radius, 0.012)[:, None]
+        normals = unit(truth.normals + place_noise / curvature_radius * across[1])
+        points = truth.points + curvature_radius * (truth.normals - normals)
+    average = tactile.average + low_pass(FLAG_CUTOFF, max(period, interval)) * (reading - tactile.average)
+    contact = flag(tactile.contact, average, 1.0 if generator is None else max(noise, 1.0))
     age = min(max(age - interval, 0.0), interval)
-    found = reading, forces, contact, points, normals, lagged, average, sliding
-    return TactileState(*(torch.from_numpy(x).to(device) for x in found), age=age)
+    return TactileState(reading, forces, contact, points, normals, lagged, average, sliding, age)
 
 
-def flag(before: Any, average: Any, factor: Any) -> Any:
+def flag(before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: Float[Tensor, "f"] | float) -> Tensor:
     """Return contact flags from the flags `before` and the low-passed force `average` [N], with hysteresis.
 
-    `factor` multiplies the two thresholds, for noisier sensors. All are tensors, or all are arrays.
+    `factor` multiplies the two thresholds, for noisier sensors.
     """
-    return (average > TOUCH_ON * factor) | (before & (average > 0.5 * TOUCH_ON * factor))
+    return torch.where(before, average > 0.5 * TOUCH_ON * factor, average > TOUCH_ON * factor)
 
 
 def low_pass(cutoff: float, period: float) -> float:
