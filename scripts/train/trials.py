@@ -81,6 +81,7 @@ def trials(
     bodies: int = 20 * len(FAMILIES),
     workers: int | str = 1,
     hands: tuple[str, ...] = HANDS,
+    first: int = 0,
 ) -> None:
     """Try grasps of all hands on household bodies; what is in the folder is not run again.
 
@@ -89,15 +90,19 @@ def trials(
         bodies: number of bodies; they are shared among the hands.
         workers: number of processes, or the address of a Dask scheduler.
         hands: whose share is tried.
+        first: number of the first body, so that more bodies can follow in a folder of their own.
     """
     for hand in hands:
-        counts = run_trials(hand, bodies, folder, workers).card["counts"]
+        counts = run_trials(hand, bodies, folder, workers, first=first).card["counts"]
         print(f"{hand}: {counts['tries']} trials on {counts['objects']} bodies, {counts['passed']} passed")
 
 
-def run_trials(hand: str, bodies: int, folder: Path, workers: int | str = 1, seed: int = 0) -> GraspShards:
-    """Try grasps of one hand on its share of the first bodies, and return the data set."""
-    numbers = range(HANDS.index(hand), bodies, len(HANDS))
+def run_trials(
+    hand: str, bodies: int, folder: Path, workers: int | str = 1, seed: int = 0, first: int = 0
+) -> GraspShards:
+    """Try grasps of one hand on its share of some bodies from the `first` on, and return the data set."""
+    numbers = range(first, first + bodies)
+    numbers = [k for k in numbers if k % len(HANDS) == HANDS.index(hand)]
     model = load_hand(hand)
     of_hand = {"name": hand, "option": model.source.option, "sha256": model.source.sha256}
     of_hand |= {"joint_names": ", ".join(model.joint_names), "finger_names": ", ".join(model.finger_names)}
