@@ -29,7 +29,7 @@ HIDDEN, TABLE_FACE, SAMPLES = 0.006, 0.002, 1500
 """Distance [m] of hidden surface from the cloud; height [m] of the face on the table, which is left out; points."""
 
 Row = dict[str, Any]
-"""The family, the kind of hidden side with whether there was a table, errors over the posterior's deviations."""
+"""Family, group, the kind of hidden side with whether there was a table, errors over the posterior's deviations."""
 
 
 def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views: tuple[str, ...] = ()) -> None:
@@ -72,21 +72,20 @@ def _held(ratios: list[np.ndarray], factor: float) -> list[float]:
 
 
 def format_shares(rows: Sequence[Row]) -> str:
-    """Return what bands hold with the factor of each row, by kind, with intervals over families, as a table."""
+    """Return what bands hold with each row's factor, by kind and group, with intervals over families, as a table."""
     table: list[tuple[str, ...]] = [
-        ("kind", "table", "views", "factor", "1 std_m %", "2 std_m %", "3 std_m %", "80 % in 2")
+        ("kind, group", "table", "views", "factor", "1 std_m %", "2 std_m %", "3 std_m %", "80 % in 2")
     ]
-    kinds: list[tuple[str, bool] | None] = [*sorted({row["kind"] for row in rows}, key=str), None]
-    for kind in kinds:
-        mine = [row for row in rows if kind in (row["kind"], None)]
+    labels = [[row["kind"], (row["group"], row["kind"][1]), ("all", row["kind"][1])] for row in rows]
+    for name in (name for column in zip(*labels, strict=True) for name in sorted(set(column))):
+        mine = [row for row, own in zip(rows, labels, strict=True) if name in own]
         cells = []
         for k in (1, 2, 3):
             found = mean_over((row["family"], 100 * float((row["ratio"] <= k * row["factor"]).mean())) for row in mine)
             cells.append(f"{found.value:.1f} [{found.low:.1f}, {found.high:.1f}]")
         most = np.mean([(row["ratio"] <= 2 * row["factor"]).mean() >= 0.8 for row in mine])
-        name = ("all", "") if kind is None else (kind[0], "yes" if kind[1] else "no")
         factor = f"{np.mean([row['factor'] for row in mine]):.2f}"
-        table.append((*name, str(len(mine)), factor, *cells, f"{most:.0%} of views"))
+        table.append((name[0], "yes" if name[1] else "no", str(len(mine)), factor, *cells, f"{most:.0%} of views"))
     return format_columns(table, left=(0, 1))
 
 
@@ -99,7 +98,8 @@ def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
         points, normals = sample_mesh(mesh, SAMPLES, np.random.default_rng(0))
         face = (points[:, 2] < float(mesh.bounds[0, 2]) + TABLE_FACE) & (normals[:, 2] < -0.7)
         far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
-        hidden = points[far & ~face]
+        hidden, entry = points[far & ~face], read_entry(objects, name)
+        told = {"family": entry.family, "group": entry.group}
         for table in (0.0, None):
             if not len(hidden):
                 continue
@@ -108,7 +108,5 @@ def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
             estimate = shape.predict(hidden[inside])
             ratio = np.full(len(hidden), np.inf)
             ratio[inside.numpy()] = (estimate.distance.abs() / estimate.variance.sqrt()).numpy()
-            rows.append(
-                {"family": read_entry(objects, name).family, "ratio": ratio, "kind": (shape.kind, table is not None)}
-            )
+            rows.append(told | {"ratio": ratio, "kind": (shape.kind, table is not None)})
     return rows

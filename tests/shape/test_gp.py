@@ -100,15 +100,45 @@ def test_a_rigid_motion_and_a_scale_move_the_estimate_with_the_object(shape: Sha
     near(a.variance, b.variance, 1e-6)
 
 
-def test_points_outside_the_domain_or_not_finite_are_refused_by_name(shape: ShapeGP):
+def test_points_far_outside_the_domain_or_not_finite_are_refused_by_name(shape: ShapeGP):
     edge = shape.domain_radius * shape.scale * EYE[0]
-    points = shape.center + torch.stack([0.999 * edge, 1.001 * edge])
+    points, twice = (shape.center + k * torch.stack([0.999 * edge, 1.001 * edge]) for k in (1.0, 2.0))
     assert shape.contains(points).tolist() == [True, False]
-    shape.predict(points[0])
-    with pytest.raises(BadArgument, match="1 of 2 points outside the domain"):
-        shape.predict(points)
+    shape.predict(torch.cat([points, twice[:1]]))
+    with pytest.raises(BadArgument, match="1 of 2 points far outside the domain"):
+        shape.predict(twice)
+    for strict in (shape.differentiate, shape.joint, shape.update):
+        with pytest.raises(BadArgument, match="1 of 2 points outside the domain"):
+            strict(points)
     with pytest.raises(BadArgument, match="points"):
         shape.predict(torch.full((2, 3), torch.nan))
+
+
+@pytest.mark.promise("N4")
+def test_beside_the_domain_distance_grows_outward_from_its_edge_and_the_deviation_is_the_priors(shape: ShapeGP):
+    out, radius = unit(queries(shape, 40) - shape.center), shape.domain_radius * shape.scale
+
+    def at(share: float) -> Tensor:
+        return shape.center + share * radius * out
+
+    inside, edge, beyond = (shape.predict(at(share)) for share in (0.3, 1.0 - 1e-9, 1.0 + 1e-9))
+    near(beyond.distance, edge.distance, 1e-7)
+    for share in (1.1, 1.9):
+        found = shape.predict(at(share))
+        grown = (found.distance - edge.distance) * shape.scale / radius
+        near(grown, torch.full_like(grown, share - 1.0), 1e-7)
+        # The closed form of the thin plate's prior: the variances psi^3 of a distance, 6 psi of a gradient's component.
+        prior = torch.diag(real([shape.psi**3, *[6 * shape.psi] * 3]))
+        near(found.covariance, prior.expand(40, 4, 4), 1e-9)
+        near(found.std_m, torch.full_like(grown, 0.65 * shape.scale * shape.psi**1.5), 1e-9)
+        assert (found.variance > edge.variance).all()
+    points, step = torch.cat([at(1.3), at(0.3)]).requires_grad_(), 1e-7
+    mixed = shape.predict(points)
+    near(mixed.distance[40:].detach(), inside.distance, 1e-12)  # neighbours outside change nothing
+    (slope,) = torch.autograd.grad(mixed.distance.sum(), points)
+    moved = [shape.predict(points.detach() + k * step * axis).distance for k in (1, -1) for axis in EYE]
+    near(slope, (torch.stack(moved[:3], 1) - torch.stack(moved[3:], 1)) / (2 * step), 1e-3)
+    near(mixed.normal.detach(), unit(slope), 1e-9)
 
 
 def test_a_sum_of_an_estimate_and_other_terms_is_minimised_on_the_surface(shape: ShapeGP):

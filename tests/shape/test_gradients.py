@@ -273,6 +273,13 @@ def test_a_vessel_is_differentiable_on_both_walls(vessel: HollowShape):
         close(tensors(getattr(vessel, name)(x.clone().requires_grad_())), tensors(getattr(vessel, name)(x)), 1e-6)
 
 
+@pytest.mark.parametrize("kernel", ["thin_plate", "rbf"])
+def test_estimates_beside_the_domain_have_derivatives_too(kernel: str):
+    shape = shape_of(kernel)
+    radius = torch.tensor([[0.0], [0.8], [1.2], [1.9]]).double() * shape.domain_radius
+    check(partial(predict, shape), radius * directions(4, seed=5))
+
+
 def test_what_is_not_differentiable_refuses_by_name():
     shape, y = shape_of("rbf"), SEEN.distance.clone().requires_grad_()
     tracked = shape_of("rbf", dataclasses.replace(SEEN, distance=y))

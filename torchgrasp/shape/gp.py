@@ -102,10 +102,19 @@ class ShapeGP(Posterior, Normalisation):
         Distance, variance and covariance are normalised by `scale` [m]. The estimate has the dtype of `points`, and is
         differentiable in the points to any order. Inside torch.vmap the domain is not checked.
 
+        Outside the domain, within its diameter of the centre, the distance grows outward from that at the nearest point
+        of the domain, with slope 1. Covariance and `std_m` are there the prior's.
+
         Raises:
-            BadArgument: non-finite numbers, or a point outside the domain, where a thin plate's variance is negative.
+            BadArgument: non-finite numbers, or a point farther outside, where a thin plate's variance is negative.
+
+        >>> from torchgrasp import fit_shape, load_object
+        >>> shape = fit_shape(load_object("jug").view)
+        >>> edge = shape.center + torch.tensor([shape.domain_radius * shape.scale, 0.0, 0.0])
+        >>> shape.predict(edge + torch.tensor([0.01, 0.0, 0.0])).std_m > 0.1
+        tensor(True)
         """
-        mean, spread = self.estimate(self._queries(points))
+        mean, spread = self._estimate_or_prior(self._queries(points, 2.0))
         variance = spread[:, 0, 0]
         std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
         parts = mean[:, 0], unit(mean[:, 1:]), variance, spread, std_m
@@ -113,7 +122,10 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return the derivatives of the results of `predict` by the query points, per metre; raises the same errors.
+        """Return the derivatives of the results of `predict` by the query points, per metre.
+
+        Raises:
+            BadArgument: non-finite numbers, or a point outside the domain: at its edge the deviation jumps.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> view = load_object("jug").view
@@ -138,7 +150,7 @@ class ShapeGP(Posterior, Normalisation):
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of distance and gradient, in normalised units, at up to 1000 points [m].
 
-        Raises the errors of `predict`.
+        Raises the errors of `differentiate`, and `BadArgument` for more points.
         """
         x = self._queries(points)
         if len(x) > MAX_JOINT:
@@ -153,7 +165,7 @@ class ShapeGP(Posterior, Normalisation):
 
         Samples of one seed are differentiable in the points twice, unless points coincide.
 
-        Raises the errors of `predict`.
+        Raises the errors of `joint`.
         """
         joint, prior = self.joint(points.double()), float(self.prior_block()[0, 0].detach())
         root = symmetric_root(joint.covariance, prior, "query points within the domain")
@@ -224,19 +236,38 @@ class ShapeGP(Posterior, Normalisation):
             cloud=move(self.cloud, b_from_a),
         )
 
-    def _queries(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "q 3"]:
-        """Return query points [m] as normalised points (q, 3); raise `BadArgument` for points outside the domain."""
-        flat = points.reshape(-1, 3)
+    def _queries(self, points: Float[Tensor, "*b 3"], reach: float = 1.0) -> Float[Tensor, "q 3"]:
+        """Return query points [m] as normalised points (q, 3); raise `BadArgument` beyond `reach` radii of domain."""
+        flat, radius = points.reshape(-1, 3), reach * self.domain_radius
         x = self.normalise(flat.double().to(self.device))
-        radius = torch.linalg.vector_norm(x.detach(), dim=-1)
-        outside = radius > self.domain_radius
+        away = torch.linalg.vector_norm(x.detach(), dim=-1)
+        outside = away > radius
         if is_known(outside) and bool(outside.any()):
             first = int(torch.nonzero(outside)[0])
-            found = f"{int(outside.sum())} of {len(flat)} points outside the domain, the first {flat[first].tolist()} m"
-            away = f"{float(radius[first]) * self.scale:.4g} m from the centre"
-            allowed = f"points within {self.domain_radius * self.scale:.4g} m of {self.center.tolist()} m"
-            raise BadArgument("points", f"{found}, {away}", allowed)
+            where = "outside the domain" if reach == 1.0 else "far outside the domain"
+            found = f"{int(outside.sum())} of {len(flat)} points {where}, the first {flat[first].tolist()} m"
+            distance = f"{float(away[first]) * self.scale:.4g} m from the centre"
+            allowed = f"points within {radius * self.scale:.4g} m of {self.center.tolist()} m"
+            raise BadArgument("points", f"{found}, {distance}", allowed)
         return x
+
+    def _estimate_or_prior(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+        """Return the results of `estimate`; outside the domain a growing distance with the prior's covariance.
+
+        The gradient there has length 1. A prior's variance is positive everywhere. Within the domain's diameter of the
+        centre a ball of the domain's size holds both, and in such a ball the kernel is a covariance.
+        """
+        outside = (torch.linalg.vector_norm(x.detach(), dim=-1) > self.domain_radius)[:, None]
+        if not (is_known(outside) and bool(outside.any())):
+            return self.estimate(x)
+        outward = unit(torch.where(outside, x, 1.0))  # with finite derivatives at points inside, too
+        nearest = torch.where(outside, self.domain_radius * outward, x)
+        mean, spread = self.estimate(nearest)
+        away = ((x - nearest) * outward).sum(-1, keepdim=True)
+        slope = (mean[:, 1:] * outward).sum(-1, keepdim=True)
+        across = self.domain_radius / (self.domain_radius + away) * (mean[:, 1:] - slope * outward)
+        grown = torch.cat([mean[:, :1] + away, unit(outward + across)], 1)
+        return torch.where(outside, grown, mean), torch.where(outside[..., None], self.prior_block(), spread)
 
 
 def _reshape(rows: Float[Tensor, "q *c"], points: Float[Tensor, "*b 3"]) -> Tensor:

@@ -105,7 +105,7 @@ def _measure_true_surface(
     far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
     edge, (feet, _) = find_edges(points, normals), nearest_on_mesh(surface, points)
     error = torch.linalg.vector_norm(feet - points, dim=-1)
-    # The surface may reach a little over the domain, where `predict` refuses.
+    # The surface may reach a little over the domain, where `predict` knows the prior alone.
     angle = _angle(unit(shape.jet(shape.normalise(feet)).gradient), normals)
     inside = shape.contains(points)
     estimate = shape.predict(points[inside])
