@@ -17,6 +17,7 @@ from torchgrasp.plan import certify, closure_probability, plan_contacts
 from torchgrasp.hand import Hand, load_hand
 from torchgrasp.posture_model import GraspMixture, encode, fit_mixture, load_mixture, sample_configurations
 from torchgrasp.ik import solve_ik
+from torchgrasp.success import GraspTask, explain_success
 from torchgrasp.planner import explain_empty, plan_grasps, plan_scene, stream_grasps
 from torchgrasp.control import ClosingReference, GraspController, closing_gains
 from torchgrasp.evaluation import close_hand
@@ -30,7 +31,7 @@ __all__ = [
     "list_objects", "load_object", "load_scene", "ShapeGP", "fit_shape",
     "certify", "closure_probability", "plan_contacts", "Hand", "load_hand",
     "GraspMixture", "encode", "fit_mixture", "load_mixture", "sample_configurations",
-    "solve_ik", "stream_grasps", "explain_empty", "plan_scene",
+    "solve_ik", "GraspTask", "explain_success", "stream_grasps", "explain_empty", "plan_scene",
     "ClosingReference", "GraspController", "closing_gains", "close_hand",
 ]  # fmt: skip
 

@@ -173,6 +173,7 @@ class Status(enum.IntEnum):
     NEIGHBOUR_COLLISION = 29, "a link of the hand would touch a neighbour of the object, or space that may be full"
     UNREACHABLE = 30, "the arm cannot bring the hand to this pose (`reachable` refuses it)"
     BURIED = 31, "something lies on the object or leans over it"
+    NO_PROMISE = 39, "the predicted success is less than the promise needs: give a lower one, or add a second view"
     # the object in its picture, before it is planned
     FEW_PIXELS = 32, "too few pixels show the object: bring the camera nearer"
     OFF_TABLE = 33, "the object is not over the table: give the table that it stands on"

@@ -166,8 +166,7 @@ class Certificate(Batch):
     contacts; phi are their coefficients. `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio`
     is the smallest over the largest singular value of W. `residual` is the largest |W phi|. `closed`, which means force
     closure, needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13) too. `witness` is
-    a unit wrench w with w . v >= -margin for every column v of W. If the contacts have no force closure, no contact
-    force opposes w.
+    a unit wrench w with w . v >= -margin for every column v of W. Without force closure no contact force opposes w.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -219,10 +218,10 @@ class Grasps(Batch):
     Finger i touches contact i. `pregrasp` are the joints of the opened hand, which is at the same pose or, where its
     links would be in the table, above it (`ik.opened_pose`). `approach` is the unit direction in which the opened hand
     moves straight there. `clearance` [m] is the least distance of the links from the estimated surface, from each other
-    and from the table; fingertips may touch the surface. `normal_angle`
-    [rad] is the angle between pad axis and contact direction. `score` is the log-odds of the predicted success, which
-    ranks the grasps. `known` tells for which grasps trials support the prediction; None means for all. `meta` holds
-    names, units, hashes and the seed as text.
+    and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle between pad axis and contact
+    direction. `score` is the log-odds of the predicted success, which ranks the grasps; `interval` bounds the share of
+    such grasps that held in trials (95 % over families). `known` tells for which grasps trials support the prediction;
+    None means for all. `meta` holds names, units, hashes and the seed as text.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
@@ -244,6 +243,7 @@ class Grasps(Batch):
     status: Int[Tensor, "g"]
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
     known: Bool[Tensor, "g"] | None = None
+    interval: Annotated[Float[Tensor, "g 2"], ANY] | None = None
 
     @property
     def success(self) -> Float[Tensor, "g"]:

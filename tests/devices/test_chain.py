@@ -13,9 +13,11 @@ from tests.make import cup_view, see
 from tests.pinch import QUICK, cylinder, pinch
 from torchgrasp import (
     ContactSpec,
+    GraspTask,
     PointCloud,
     certify,
     explain_empty,
+    explain_success,
     fit_shape,
     load_hand,
     load_object,
@@ -58,6 +60,7 @@ SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
 VIEW, UP = load_object("cylinder").view, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 PLANS = {
+    "task and promise": lambda cloud, hand: plan_grasps(cloud, hand, SPEC, 2, task=GraspTask(0.1), promise=0.8),
     "stream": lambda cloud, hand: list(stream_grasps(cloud, hand, SPEC, 2)),
     "list": lambda cloud, hand: plan_grasps([cloud], hand, SPEC, 2),
     "any fingers": lambda cloud, hand: plan_grasps(cloud, hand, SPEC, 2, fingers="auto"),
@@ -128,6 +131,14 @@ def test_what_is_written_is_the_same_wherever_hand_and_grasps_are(device, hand, 
     expected = TEXTS[name](hand, grasps)
     for one, other in ((hand, sent(grasps)), (sent(hand), grasps), (sent(hand), sent(grasps))):
         assert TEXTS[name](one, other) == expected
+
+
+@pytest.mark.parametrize("where", ["shape", "grasps", "hand", "all"])
+def test_what_moves_success_is_the_same_wherever_its_parts_are(device, hand, shape, grasps, where):
+    parts = {"grasps": grasps, "hand": hand, "shape": shape}
+    moved = {name: sent(part) if where in (name, "all") else part for name, part in parts.items()}
+    found, expected = (explain_success(**x, task=GraspTask(mass=0.8)) for x in (moved, parts))
+    assert [(cost.cause, cost.sentence) for cost in found] == [(cost.cause, cost.sentence) for cost in expected]
 
 
 def test_files_are_the_same(device, shape, tmp_path):

@@ -11,7 +11,7 @@ from torchgrasp import ContactSpec, PointCloud, Status, explain_empty, load_obje
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.planner.changes import list_changes
 from torchgrasp.planner.explain import Funnel, Losses, order_changes
-from torchgrasp.planner.problem import Request
+from torchgrasp.planner.request import Request
 from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
 
 TABLE = ContactSpec(table=0.0)

@@ -28,7 +28,7 @@ from torchgrasp.export import format_grasps
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand import hand_of
 from torchgrasp.planner.grasps import expected_success
-from torchgrasp.planner.problem import finger_sets
+from torchgrasp.planner.request import finger_sets
 
 SPEC = ContactSpec(table=0.0)
 ALL = ("index", "middle", "ring", "thumb")

@@ -14,7 +14,8 @@ from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.planner import ThingPlan
 from torchgrasp.planner.batches import rank
 from torchgrasp.planner.graspable import hand_span, is_vague, judge_things, order_by_ease
-from torchgrasp.planner.problem import Problem, Request, take_target
+from torchgrasp.planner.problem import Problem, take_target
+from torchgrasp.planner.request import Request
 
 HAND = load_hand("allegro")
 BOX = (0.0, 0.0, 0.06, 0.1)

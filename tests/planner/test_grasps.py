@@ -1,7 +1,5 @@
 """The whole chain on a shipped view: every returned grasp is judged again, by code of its own."""
 
-import json
-
 import pytest
 import torch
 
@@ -10,6 +8,7 @@ from torchgrasp import (
     ContactPlan,
     Contacts,
     ContactSpec,
+    GraspTask,
     PointCloud,
     Status,
     explain_empty,
@@ -21,13 +20,15 @@ from torchgrasp import (
 from torchgrasp.base import named_tensors
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.plane import Plane, move, upright_frame
-from torchgrasp.ik.ranking import FEATURES, MODEL, rank_by_success, success_features
+from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.planner.problem import digest
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, encode_fingertips, load_mixture
-from torchgrasp.shape.surface import extract_surface
+from torchgrasp.success.explain import measure_again
+from torchgrasp.success.model import load_model
+from torchgrasp.success.order import rank_by_success
+from torchgrasp.success.promise import Promise
 
 SPEC = ContactSpec(table=0.0)
 VIEW = load_object("cylinder").view
@@ -58,23 +59,48 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
     assert bool((scores[:-1] >= scores[1:]).all())
     good = int((grasps.status == Status.OK).sum())
     odds = torch.randn(good, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ranked = rank_by_success(grasps, odds)
+    ranked = rank_by_success(grasps, odds, torch.ones(good, dtype=torch.bool))
     assert torch.equal(ranked.score[:good], odds.sort(descending=True).values.to(grasps.score))
     assert bool((ranked.status[:good] == Status.OK).all()) and not bool((ranked.status[good:] == Status.OK).any())
     torch.testing.assert_close(ranked.success[:good], torch.sigmoid(ranked.score[:good]))
     assert not bool(ranked.success[good:].any())
 
 
-def test_success_is_what_the_model_says_of_the_surface_that_was_planned_on(run):
+def test_success_is_what_the_model_says_of_the_features_that_an_explanation_measures_again(run):
     hand, grasps, stages = run
-    upright_from_obj = inverse(upright_frame(VIEW.points, VIEW.viewpoint, SPEC.plane))
-    best = move(grasps[grasps.status == Status.OK][:5], upright_from_obj)
-    shape = stages["shape"].moved(upright_from_obj)
-    center = extract_surface(shape).vertices.mean(0)
-    features = success_features(hand, shape, best, center, SPEC.friction, seed=0)
-    model = json.loads(MODEL.read_text())
-    odds = features @ torch.tensor([model["weights"][name] for name in FEATURES], dtype=features.dtype)
-    torch.testing.assert_close(best.success, 1 / (1 + (-odds - model["bias"][hand.name]).exp()), rtol=1e-6, atol=1e-6)
+    best = grasps[grasps.status == Status.OK][:5]
+    odds = load_model().log_odds(measure_again(best, hand, stages["shape"], GraspTask()))
+    torch.testing.assert_close(best.success, torch.sigmoid(odds), rtol=1e-6, atol=1e-6)
+    near(best.interval, load_model().interval(odds), 1e-6)
+
+
+@pytest.mark.parametrize("task", [GraspTask(mass=0.02, force=8.0, lift=False), GraspTask(mass=0.9)])
+def test_a_task_changes_the_predictions_and_not_the_grasps(task):
+    hand, shapes = load_hand("barrett"), []
+    note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731
+    usual = plan_grasps(VIEW, hand, SPEC, starts=12)
+    grasps = plan_grasps(VIEW, hand, SPEC, starts=12, task=task, observer=note)
+    best = grasps[grasps.status == Status.OK]
+    odds = load_model().log_odds(measure_again(best, hand, shapes[0], task))
+    near(best.score, odds, 1e-6)
+    assert grasps.meta["task"] == task.describe() != usual.meta["task"]
+    first, second = (set(map(tuple, found[found.status == Status.OK].joints.tolist())) for found in (usual, grasps))
+    assert first <= second or second <= first  # further constraints are tried where no grasp is likely to hold
+
+
+def test_a_promise_refuses_the_less_likely_grasps_of_the_same_plan(monkeypatch):
+    hand = load_hand("barrett")
+    usual = plan_grasps(VIEW, hand, SPEC, starts=12)
+    bound = float(usual.score[usual.status == Status.OK].median())
+    monkeypatch.setattr("torchgrasp.success.order.find_promise", lambda share: Promise(bound, 400, 100))
+    kept = plan_grasps(VIEW, hand, SPEC, starts=12, promise=0.9)
+    sure, refused = (kept[kept.status == status] for status in (Status.OK, Status.NO_PROMISE))
+    assert len(sure) and len(refused) and bool((sure.score >= bound).all()) and bool((refused.score < bound).all())
+    assert torch.equal(kept.score[: len(sure) + len(refused)], usual.score[: len(sure) + len(refused)])
+    assert not bool(refused.success.any()) and kept.meta["promise"].startswith("0.9")
+    monkeypatch.setattr("torchgrasp.success.order.find_promise", lambda share: None)
+    none = plan_grasps(VIEW, hand, SPEC, starts=12, promise=0.9)
+    assert len(none) and int(Status.OK) not in none.status.tolist()
 
 
 @pytest.mark.promise("N5")
@@ -139,7 +165,8 @@ def test_the_file_names_everything_and_stages_come_in_the_order_of_the_flow(run,
 def test_bad_arguments_are_refused_before_any_work(call):
     hand = load_hand("barrett")
     for name, bad in (
-        ("starts", 0), ("mode", "best"), ("ranking", "best"), ("colour", "red"),
+        ("starts", 0), ("mode", "best"), ("ranking", "best"), ("colour", "red"), ("task", 0.5), ("promise", 0.4),
+        ("promise", 1.0),
     ):  # fmt: skip
         with pytest.raises((BadArgument, TypeError), match=name):
             call(VIEW, hand, **{name: bad})
@@ -175,3 +202,9 @@ def test_success_is_unknown_where_the_cloud_has_few_points_or_one_flat_face(rows
     grasps = plan_grasps(PointCloud(seen, viewpoint=VIEW.viewpoint), load_hand("barrett"), SPEC, starts=20)
     good = grasps[grasps.status == Status.OK]
     assert len(good) and bool(good.success.isnan().all())
+
+
+def test_nothing_is_promised_of_an_object_that_may_be_elsewhere():
+    task = GraspTask(displaced=True)
+    with pytest.raises(BadArgument, match=r"promise: expected None, got 0\.9 for a displaced object"):
+        plan_grasps(VIEW, load_hand("barrett"), SPEC, starts=5, task=task, promise=0.9)

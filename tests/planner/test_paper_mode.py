@@ -7,10 +7,10 @@ from tests.make import load_hand, near
 from torchgrasp import ContactSpec, Status, load_object, plan_grasps
 from torchgrasp.geometry.frames import apply, virtual_frame
 from torchgrasp.ik.candidates import PAPER_TOLERANCE
-from torchgrasp.ik.ranking import rank_by_variance
 from torchgrasp.posture_model.mixture import PAPER_ENERGY, load_mixture
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.shape.surface import extract_surface
+from torchgrasp.success.order import rank_by_variance
 
 SPEC = ContactSpec.paper(table=0.0)
 

@@ -209,7 +209,7 @@ def grasps_from_joints(
         permutation=torch.arange(f).expand(g, f).clone(), tip_error=zeros, clearance=hand.self_clearance(joints),
         normal_angle=zeros, certificate=certificate, score=torch.zeros(g, dtype=torch.float64),
         status=torch.where(certificate.closed, int(Status.OK), int(Status.NOT_CLOSED)), meta=meta,
-        known=torch.zeros(g, dtype=torch.bool),
+        known=torch.zeros(g, dtype=torch.bool), interval=torch.tensor([[0.0, 1.0]], dtype=torch.float64).repeat(g, 1),
     )  # fmt: skip
 
 

@@ -195,6 +195,7 @@ def check_candidates(
         score=score(contacts, errors.normal_angle, problem.center),
         status=torch.where(planned == Status.OK, status, planned),
         known=torch.ones_like(touching),
+        interval=torch.zeros_like(errors.clearance)[:, None].repeat(1, 2),
     )
 
 

@@ -2,7 +2,7 @@
 
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.grasps import plan_grasps, stream_grasps
-from torchgrasp.planner.problem import PlanOptions
+from torchgrasp.planner.request import PlanOptions
 from torchgrasp.planner.scene import ScenePlan, ThingPlan, plan_scene
 
 __all__ = [

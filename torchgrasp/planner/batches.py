@@ -12,21 +12,17 @@ from torchgrasp.errors import Status
 from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_as_paper, solve_contact_first
 from torchgrasp.ik.joint import solve_sliding, try_best_seeds
 from torchgrasp.ik.motion import collision_probability
-from torchgrasp.ik.ranking import (
-    by_success,
-    is_known,
-    rank_by_success,
-    rank_by_variance,
-    success_features,
-    success_log_odds,
-)
 from torchgrasp.ik.refine import ITERATIONS
 from torchgrasp.plan.solve import plan_in_turn
 from torchgrasp.plan.starts import check_starts
 from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
-from torchgrasp.planner.problem import Problem, ignore
+from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.request import ignore
 from torchgrasp.shape.values import surface_deviation
 from torchgrasp.specs import Ranking
+from torchgrasp.success.features import measure_grasps
+from torchgrasp.success.model import load_model
+from torchgrasp.success.order import by_success, is_known, keep_promise, rank_by_success, rank_by_variance
 from torchgrasp.values import ContactPlan, Grasps, format_success
 
 FIRST, GROWTH = 8, 6
@@ -173,24 +169,25 @@ class Planner:
 
 
 def rank(problem: Problem, solved: Grasps) -> Grasps:
-    """Return grasps in the order of the request's ranking, scored by the log-odds of success.
+    """Return grasps in the order of the request's ranking, scored by the log-odds of success at the request's task.
 
-    If the object cannot be lifted out of its surroundings, its grasps get the status `BURIED`.
+    If the object cannot be lifted out of its surroundings, its grasps get the status `BURIED`. Grasps of less success
+    than a promise asks for get `NO_PROMISE`.
     """
-    request, hand = problem.request, problem.hand
+    request, hand, spec = problem.request, problem.hand, problem.spec
     if problem.buried:
         buried = torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)
         solved = dataclasses.replace(solved, status=buried)
     good = solved[solved.status == Status.OK]
-    weight = (0.0, 0.0, 0.0 if problem.spec.plane is None else -1.0)
-    features = success_features(hand, problem.shape, good, problem.center, problem.spec.friction, request.seed, weight)
-    log_odds = success_log_odds(features, hand.name)
+    task, shape, vertices = request.grasp_task, problem.shape, problem.surface.vertices
+    features = measure_grasps(hand, shape, vertices, good, spec.friction, task, task.lifts(spec.plane))
+    log_odds = load_model(features.device).log_odds(features)
     if problem.obstacles is not None:
-        free = 1 - collision_probability(hand, good, problem.obstacles, problem.spec.plane).to(log_odds)
+        free = 1 - collision_probability(hand, good, problem.obstacles, spec.plane).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
-    known = torch.ones_like(solved.status, dtype=torch.bool)
-    known[solved.status == Status.OK] = is_known(problem.shape, good, problem.spec.friction) & (not problem.vague)
-    ranked = rank_by_success(dataclasses.replace(solved, known=known), log_odds)
+    ranked = rank_by_success(solved, log_odds, is_known(features) & (not problem.vague))
+    if request.promise is not None:
+        ranked = keep_promise(ranked, request.promise)
     return ranked if request.order == "success" else rank_by_variance(ranked)
 
 

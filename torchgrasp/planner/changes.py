@@ -6,7 +6,8 @@ from typing import Any
 
 from torchgrasp.errors import Status
 from torchgrasp.hand.load import hands_folder, load_hand
-from torchgrasp.planner.problem import Request, finger_sets, take_target
+from torchgrasp.planner.problem import take_target
+from torchgrasp.planner.request import Request, finger_sets
 from torchgrasp.scene.scene import Scene
 
 FRICTIONS = (0.4, 0.8, 1.2)  # coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone

@@ -13,11 +13,12 @@ from torchgrasp.checks import Count, checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.ik.attempts import seed_costs
-from torchgrasp.ik.ranking import LEAST_ARM, load_arm, rank_in_group
+from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.seeds import nearest_postures, query_mixture
 from torchgrasp.plan.certify import certify
 from torchgrasp.planner.problem import Problem
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
+from torchgrasp.success.loads import load_arm
 from torchgrasp.values import Certificate, ContactPlan, Contacts, IKSeeds
 
 LIKELY = 2
@@ -121,7 +122,7 @@ def contact_costs(problem: Problem, found: SeededContacts) -> Float[Tensor, "b"]
     residual = seed_costs(problem.reach(contacts, certificate), first)
     least = torch.full((len(contacts),), torch.inf, dtype=residual.dtype, device=residual.device)
     least = least.scatter_reduce(0, first.row, residual, "amin")
-    return least.clamp_min(1e-3).log() + 0.3 * (load_arm(contacts.points, problem.center) + LEAST_ARM).log()
+    return least.clamp_min(1e-3).log() + 0.3 * (load_arm(contacts.points, problem.center) + 0.1).log()
 
 
 def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:

@@ -15,7 +15,7 @@ from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.changes import Change, list_changes, more_starts
 from torchgrasp.planner.grasps import expected_success, plan_grasps
-from torchgrasp.planner.problem import Request
+from torchgrasp.planner.request import Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec

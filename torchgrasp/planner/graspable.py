@@ -13,12 +13,12 @@ from torchgrasp.errors import Status
 from torchgrasp.geometry.plane import to_upright, upright_frame
 from torchgrasp.geometry.support import find_table
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.ranking import largest_known
 from torchgrasp.scene.scene import Scene
 from torchgrasp.scene.segment import OVERHANG
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
+from torchgrasp.success.order import largest_known
 
 
 @checked

@@ -19,7 +19,8 @@ from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_tasks
 from torchgrasp.planner.batches import describe, plan_hand, rank_together
-from torchgrasp.planner.problem import Budget, PlanOptions, Problem, Request
+from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.request import Budget, PlanOptions, Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
@@ -80,18 +81,18 @@ def plan_grasps(
             sequence of clouds gives a list of results. A bad cloud gives no grasps, and `meta["refused"]` holds the
             reason.
         hand: from `load_hand`; it is moved to the device of the cloud.
-        spec: the constraints on contacts; each finger gets one contact. The default is `ContactSpec()`, in mode "paper"
-            `ContactSpec.paper()`.
+        spec: the constraints on contacts; by default `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
-        time_budget: wall time [s]. No batch begins after it, so the result depends on the machine. `meta["starts"]`
-            is the number of initial guesses that were planned. None means no limit.
+        time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of planned guesses.
         workers: number of processes for a sequence of clouds; 0 means this process.
         fingers: the fingers that grasp, as in `load_hand`; by default those of `hand`. "auto" chooses, of the sets that
             the hand declares, the one with the greatest expected success. `hand_of` loads the hand of the result.
-        mode: how hand postures are found, see `Mode`. All modes but "joint" need the hand's learned model, and three
-            fingers.
+        mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.
         ranking: criterion by which grasps are ordered, see `Ranking`; by default "success", in mode "paper" "variance".
+        task: what the grasps must do, for which their success is predicted; by default `GraspTask()`.
+        promise: share of the returned grasps that must hold, or None; less sure grasps get the status `NO_PROMISE`.
+            `meta["promise"]` says which trials chose the bound (`torchgrasp.success.promise`).
         shape: the object's shape if it is known better than the cloud shows, as after a touch (`ShapeGP.update`).
         observer: function that is called after each stage with the stage's name, a line of text and its result.
         reachable: function that returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4) an arm reaches, in
@@ -270,7 +271,7 @@ def no_grasps(hand: Hand) -> Grasps:
     certificate = Certificate(none(), none(), none(), none().bool(), none(6))
     return Grasps(
         none(hand.dof), none(hand.dof), none(3), none(4, 4), contacts, none(f).long(), none(f), none(), none(f),
-        certificate, none(), none().long(), known=none().bool(),
+        certificate, none(), none().long(), known=none().bool(), interval=none(2),
     )  # fmt: skip
 
 

@@ -1,18 +1,16 @@
-"""The planning problem: the checked arguments of `plan_grasps`, and values derived from them in an upright frame."""
+"""The planning problem: values derived from the arguments of `plan_grasps`, in an upright frame."""
 
 import dataclasses
 import hashlib
-import math
-from collections.abc import Callable
 from functools import cached_property
-from typing import Annotated, Any, TypedDict
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import settle
-from torchgrasp.checks import Count, Range, Seed, checked
+from torchgrasp.checks import Seed, checked
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat
 from torchgrasp.errors import BadArgument
@@ -21,14 +19,13 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, round_upright, upright_frame
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.hand_toml import Fingers
-from torchgrasp.hand.load import with_fingers
 from torchgrasp.ik.candidates import GraspProblem, Reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
 from torchgrasp.ik.seeds import PostureLibrary
 from torchgrasp.plan.problem import walls_of
 from torchgrasp.plan.starts import Settled, settle_flatness
+from torchgrasp.planner.request import Observer, Request, ignore
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.scene.scene import Scene
@@ -36,94 +33,11 @@ from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.shape.fit import FitOptions, fit_upright
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import Mesh, extract_mesh
-from torchgrasp.specs import ContactSpec, Mode, Ranking
+from torchgrasp.specs import ContactSpec
+from torchgrasp.success.promise import describe_promise
 from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud
 
 TARGET_POINTS = 1000  # most points of a scene's target that are used: they lie a few millimetres apart
-
-Budget = Annotated[float, Range(1e-3, math.inf)]
-"""A time budget [s]."""
-Observer = Callable[[str, str, Any], None]
-"""Function that is called after each stage with the stage's name, a line of text, and the stage's result."""
-
-
-def ignore(stage: str, message: str, value: Any) -> None:
-    """Ignore the report of a planning stage: the observer that is called by default."""
-
-
-class PlanOptions(TypedDict, total=False):
-    """The types of the optional keyword arguments of `plan_grasps`, which explains them.
-
-    >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
-    >>> sorted(options)
-    ['fingers', 'ranking']
-    """
-
-    fingers: Fingers | None
-    mode: Mode
-    ranking: Ranking | None
-    shape: ShapeGP | None
-    observer: Observer
-    reachable: Reachable | None
-
-
-@checked
-@dataclasses.dataclass(frozen=True)
-class Request:
-    """The checked arguments of one call of `plan_grasps`, which explains them."""
-
-    cloud: PointCloud | Scene
-    hand: Hand
-    spec: ContactSpec | None = None
-    starts: Count = 1000
-    seed: Seed = 0
-    fingers: Fingers | None = None
-    mode: Mode = "joint"
-    ranking: Ranking | None = None
-    shape: ShapeGP | None = None
-    observer: Observer = ignore
-    reachable: Reachable | None = None
-    time_budget: Budget | None = None
-
-    @property
-    def contact_spec(self) -> ContactSpec:
-        """The given constraints on contacts; if none are given, the default constraints of the planning mode."""
-        if self.spec is not None:
-            return self.spec
-        return ContactSpec.paper() if self.mode == "paper" else ContactSpec()
-
-    @property
-    def order(self) -> Ranking:
-        """The criterion that ranks the grasps: the given one, or else the default of the planning mode."""
-        return self.ranking or ("variance" if self.mode == "paper" else "success")
-
-    @property
-    def hands(self) -> tuple[Hand, ...]:
-        """One hand for each set of fingers that may grasp."""
-        return finger_sets(self.hand, self.fingers, self.mode)
-
-
-def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
-    """Return one hand for each set of fingers to plan with.
-
-    "auto" gives all sets that the hand declares; a name or number gives that set; None gives the hand as it is.
-
-    Raises:
-        BadArgument: fingers that the hand does not have; more than three fingers, or "auto", in a mode other than
-            "joint".
-    """
-    if fingers == "auto":
-        if mode != "joint":
-            raise BadArgument("fingers", f"'auto' in mode {mode!r}", "mode 'joint'")
-        if "finger sets" not in hand.derived:
-            found = (hand, *(with_fingers(hand, option) for option in hand.source.options))
-            distinct = {one.finger_names: one for one in reversed(found)}
-            hand.derived["finger sets"] = tuple(distinct.values())[::-1]
-        return hand.derived["finger sets"]
-    chosen = hand if fingers is None else with_fingers(hand, fingers)
-    if mode != "joint":
-        chosen.require_three("mode", repr(mode))
-    return (chosen,)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,6 +187,8 @@ class Problem:
             "table": "none" if spec.plane is None else spec.plane.describe(),
             "mode": request.mode,
             "ranking": request.order,
+            "task": request.grasp_task.describe(),
+            "promise": "none" if request.promise is None else describe_promise(request.promise),
             "mixture_sha256": self.mixture_sha256,
             "seed": str(request.seed),
         }

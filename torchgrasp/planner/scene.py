@@ -15,10 +15,11 @@ from torchgrasp.ik.candidates import Reachable
 from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.problem import finger_sets
+from torchgrasp.planner.request import PlanOptions, Promised, finger_sets
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
+from torchgrasp.success.task import GraspTask
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Grasps
 
@@ -76,6 +77,8 @@ def plan_scene(
     fingers: Fingers | None = None,
     enough: Fraction = 1.0,
     reachable: Reachable | None = None,
+    task: GraspTask | None = None,
+    promise: Promised | None = None,
 ) -> ScenePlan:
     """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
@@ -91,7 +94,7 @@ def plan_scene(
         seed: random seed.
         fingers: see `plan_grasps`; "auto" chooses fingers for each object. `hand_of` loads the hand of grasps.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.
-        reachable: see `plan_grasps`.
+        reachable, task, promise: see `plan_grasps`.
 
     Raises:
         BadArgument: a scene without objects, or an argument of the wrong type or range.
@@ -104,9 +107,8 @@ def plan_scene(
     if not scene.things:
         raise BadArgument("scene", "no object on the table", "a scene with at least one object")
     finger_sets(hand, fingers)  # raises for unknown fingers
-    plan = functools.partial(
-        plan_grasps, hand=hand, spec=spec, starts=starts, seed=seed, fingers=fingers, reachable=reachable
-    )
+    options: PlanOptions = {"fingers": fingers, "reachable": reachable, "task": task, "promise": promise}
+    plan = functools.partial(plan_grasps, hand=hand, spec=spec, starts=starts, seed=seed, **options)
     plans: list[ThingPlan] = []
     judged = judge_things(scene, hand, spec)
     for label in order_by_ease(scene):

@@ -1,0 +1,58 @@
+"""A task refuses numbers that no hand can be asked for, and says what it is."""
+
+import math
+
+import pytest
+
+from torchgrasp import GraspTask
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.specs import TrialSpec
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *[("mass", x) for x in (0.0, -0.1, 11.0, math.nan, math.inf, "heavy", True, None)],
+        *[("force", x) for x in (0.0, -1.0, math.nan, math.inf, "strong")],
+        *[("lift", x) for x in ("yes", 1.0)],
+        *[("closing", x) for x in ("paper", "", None)],
+        *[("displaced", x) for x in ("no", None)],
+    ],
+)
+def test_a_wrong_field_is_named(field, value):
+    with pytest.raises(BadArgument, match=field):
+        GraspTask(**{field: value})
+
+
+def test_a_lift_in_open_loop_is_refused_and_pulls_are_not():
+    with pytest.raises(BadArgument, match="closing"):
+        GraspTask(lift=True, closing="open_loop")
+    assert not GraspTask(lift=False, closing="open_loop").lifts(Plane.horizontal(0.0))
+
+
+def test_the_object_is_lifted_where_there_is_a_table_unless_the_task_says_otherwise():
+    table = Plane.horizontal(0.0)
+    assert GraspTask().lifts(table) and not GraspTask().lifts(None)
+    assert GraspTask(lift=True).lifts(None) and not GraspTask(lift=False).lifts(table)
+
+
+def test_a_table_makes_no_lift_of_a_task_in_open_loop():
+    assert not GraspTask(closing="open_loop").lifts(Plane.horizontal(0.0))
+
+
+def test_a_task_says_what_it_is_and_two_alike_are_equal():
+    assert GraspTask().describe() == "task of 0.25 kg"
+    assert GraspTask(lift=True, mass=1.0, displaced=True).describe() == "lift of 1 kg, displaced"
+    assert GraspTask(lift=False, force=3.5).describe() == "pulls of 0.25 kg with 3.5 N"
+    assert GraspTask(0.5) == GraspTask(mass=0.5) != GraspTask(mass=0.6) and len({GraspTask(), GraspTask()}) == 1
+
+
+def test_a_table_is_a_plane():
+    with pytest.raises(BadArgument, match="table"):
+        GraspTask().lifts(0.0)
+
+
+def test_a_hand_presses_as_told_grips_in_a_lift_and_presses_a_little_in_pulls():
+    assert GraspTask(force=6.0).pressing(True) == GraspTask(force=6.0).pressing(False) == 6.0
+    assert GraspTask().pressing(True) == 0.0 and GraspTask().pressing(False) == TrialSpec().strongest

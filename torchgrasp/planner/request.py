@@ -1,0 +1,118 @@
+"""The request: the checked arguments of `plan_grasps`."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Annotated, Any, TypedDict
+
+from torchgrasp.checks import Count, Range, Seed, checked
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand_toml import Fingers
+from torchgrasp.hand.load import with_fingers
+from torchgrasp.ik.candidates import Reachable
+from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.specs import ContactSpec, Mode, Ranking
+from torchgrasp.success.task import GraspTask
+from torchgrasp.values import PointCloud
+
+Budget = Annotated[float, Range(1e-3, math.inf)]
+"""A time budget [s]."""
+Promised = Annotated[float, Range(0.5, 0.99)]
+"""A promised share of held grasps."""
+Observer = Callable[[str, str, Any], None]
+"""Function that is called after each stage with the stage's name, a line of text, and the stage's result."""
+
+
+def ignore(stage: str, message: str, value: Any) -> None:
+    """Ignore the report of a planning stage: the observer that is called by default."""
+
+
+class PlanOptions(TypedDict, total=False):
+    """The types of the optional keyword arguments of `plan_grasps`, which explains them.
+
+    >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
+    >>> sorted(options)
+    ['fingers', 'ranking']
+    """
+
+    fingers: Fingers | None
+    mode: Mode
+    ranking: Ranking | None
+    task: GraspTask | None
+    promise: Promised | None
+    shape: ShapeGP | None
+    observer: Observer
+    reachable: Reachable | None
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """The checked arguments of one call of `plan_grasps`, which explains them."""
+
+    cloud: PointCloud | Scene
+    hand: Hand
+    spec: ContactSpec | None = None
+    starts: Count = 1000
+    seed: Seed = 0
+    fingers: Fingers | None = None
+    mode: Mode = "joint"
+    ranking: Ranking | None = None
+    task: GraspTask | None = None
+    promise: Promised | None = None
+    shape: ShapeGP | None = None
+    observer: Observer = ignore
+    reachable: Reachable | None = None
+    time_budget: Budget | None = None
+
+    def __post_init__(self) -> None:
+        """Raise `BadArgument` for a promise about an object that may be elsewhere, which no trials support."""
+        if self.promise is not None and self.grasp_task.displaced:
+            raise BadArgument("promise", f"{self.promise:g} for a displaced object", "None")
+
+    @property
+    def contact_spec(self) -> ContactSpec:
+        """The given constraints on contacts; if none are given, the default constraints of the planning mode."""
+        if self.spec is not None:
+            return self.spec
+        return ContactSpec.paper() if self.mode == "paper" else ContactSpec()
+
+    @property
+    def order(self) -> Ranking:
+        """The criterion that ranks the grasps: the given one, or else the default of the planning mode."""
+        return self.ranking or ("variance" if self.mode == "paper" else "success")
+
+    @property
+    def grasp_task(self) -> GraspTask:
+        """The task for which success is predicted."""
+        return GraspTask() if self.task is None else self.task
+
+    @property
+    def hands(self) -> tuple[Hand, ...]:
+        """One hand for each set of fingers that may grasp."""
+        return finger_sets(self.hand, self.fingers, self.mode)
+
+
+def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
+    """Return one hand for each set of fingers to plan with.
+
+    "auto" gives all sets that the hand declares; a name or number gives that set; None gives the hand as it is.
+
+    Raises:
+        BadArgument: fingers that the hand does not have; more than three fingers, or "auto", in a mode other than
+            "joint".
+    """
+    if fingers == "auto":
+        if mode != "joint":
+            raise BadArgument("fingers", f"'auto' in mode {mode!r}", "mode 'joint'")
+        if "finger sets" not in hand.derived:
+            found = (hand, *(with_fingers(hand, option) for option in hand.source.options))
+            distinct = {one.finger_names: one for one in reversed(found)}
+            hand.derived["finger sets"] = tuple(distinct.values())[::-1]
+        return hand.derived["finger sets"]
+    chosen = hand if fingers is None else with_fingers(hand, fingers)
+    if mode != "joint":
+        chosen.require_three("mode", repr(mode))
+    return (chosen,)

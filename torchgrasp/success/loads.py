@@ -1,0 +1,94 @@
+"""How a grasp carries a load: the forces that it needs, the arm of the load, and the fingers that press."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.geometry.frames import apply, inverse, rotate, skew, subsets
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.hand.hand import Hand
+from torchgrasp.plan.closure import cone_edges, tangents
+from torchgrasp.plan.forces import grasp_map, least_friction_forces
+from torchgrasp.values import Contacts, Grasps
+
+CARRYING = 2.07
+"""Log-odds of success that a lift loses for each factor e on the force that carries the load."""
+
+
+def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
+    """Return the distance of `center` [m], where the load acts, from the longest side of the contacts' triangle.
+
+    The distance is divided by the triangle's height over this side, about which the object turns most easily. For more
+    than three contacts, the triangle of the smallest ratio counts.
+    """
+    if points.shape[1] > 3:
+        triples = subsets(points.shape[1], 3, points.device)
+        return load_arm(points[:, triples].flatten(0, 1), center).unflatten(0, (len(points), len(triples))).amin(1)
+    sides = points.roll(-1, dims=1) - points
+    longest = torch.linalg.vector_norm(sides, dim=-1).argmax(1)[:, None, None].expand(-1, 1, 3)
+    along, foot = unit(sides.gather(1, longest)[:, 0]), points.gather(1, longest)[:, 0]
+    opposite = points.gather(1, (longest + 2) % 3)[:, 0]
+    arm = torch.linalg.vector_norm(torch.linalg.cross(along, center - foot), dim=-1)
+    height = torch.linalg.vector_norm(torch.linalg.cross(along, opposite - foot), dim=-1)
+    return arm / (height + 0.01)  # [m], the lever of torsion
+
+
+def carrying_force(
+    contacts: Contacts, forces: Float[Tensor, "b f 3"], center: Float[Tensor, "3"], friction: float,
+    load: Float[Tensor, "3"], push: float = 0.0,
+) -> Float[Tensor, "b"]:  # fmt: skip
+    """Return the least factor s on balanced forces f_0 so that all contacts stick under a load and any push [N].
+
+    Load and push of any direction act at `center`; w is their wrench. Equal springs share it, G being the grasp map:
+
+        f = s f_0 - G^+ w,    y . f >= 0 for all edges y of the cones dual to the friction cones.
+
+    The factor is infinite if the forces do not stick at all, as where no forces balance.
+    """
+    points, normals = contacts.points.to(forces), contacts.normals.to(forces)
+    dual = cone_edges(normals, tangents(points, normals), 1.0, edges=32) + (1 - friction) * normals[:, :, None]
+    moment = skew(center.to(forces) - points.mean(1))  # maps a force at `center` to its torque
+    eye = torch.eye(3).to(forces).expand_as(moment)
+    shared = (torch.linalg.pinv(grasp_map(points)) @ torch.cat([eye, moment], 1)).unflatten(1, points.shape[1:])
+    across = torch.einsum("bfij,bfei->bfej", shared, dual)
+    lacking = across @ load.to(forces) + push * torch.linalg.vector_norm(across, dim=-1)
+    having = torch.einsum("bfi,bfei->bfe", forces, dual)
+    return torch.where(having > 0, lacking.clamp_min(0) / having, torch.inf).amax((1, 2))
+
+
+def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
+    """Return each finger's lever [m]: the norm of its joints' moment arms for a force along the contact's normal.
+
+    If the surface is displaced by e, the force of a finger whose joints have stiffness k changes by k e / lever^2.
+    """
+    joints = grasps.joints
+    hand_from_obj, coupling = inverse(grasps.obj_from_hand.to(joints)), hand.actuated.coupling.to(joints)
+    points, normals = apply(hand_from_obj, grasps.contacts.points.to(joints)), grasps.contacts.normals.to(joints)
+    arms = torch.einsum("gfih,gfi->gfh", hand.jacobian(joints, points), rotate(hand_from_obj, normals))
+    return torch.linalg.vector_norm(arms / torch.linalg.vector_norm(coupling, dim=0), dim=-1)
+
+
+def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Float[Tensor, "g"]:
+    """Return the factor on balanced contact forces at which the first drive gives its greatest torque; NaN for NaN."""
+    joints = grasps.joints
+    hand_from_obj = inverse(grasps.obj_from_hand.to(joints))
+    jacobian = hand.jacobian(joints, apply(hand_from_obj, grasps.contacts.points.to(joints)))
+    torque = torch.einsum("gfih,gfi->gh", jacobian, rotate(hand_from_obj, forces.to(joints)))
+    effort = torque.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
+    return (effort / torque.abs()).amin(1)
+
+
+def log_odds_about(
+    grasps: Grasps, centers: Float[Tensor, "c 3"], friction: float, weight: Sequence[float]
+) -> Float[Tensor, "g c"]:
+    """Return the log-odds of success of grasps for other centres of mass [m] than the first, for which they are ranked.
+
+    Only the force that carries the load, in the direction `weight`, depends on the centre.
+    """
+    points, normals = grasps.contacts.points.to(centers), grasps.contacts.normals.to(centers)
+    forces, load = least_friction_forces(points, normals, strongest=1.0), centers.new_tensor(weight)
+    carried = [carrying_force(grasps.contacts, forces, center, 0.5 * friction, load) for center in centers]
+    logs = torch.log(torch.stack(carried, -1).clamp(0.3, 100.0))
+    return grasps.score.to(centers)[:, None] - CARRYING * (logs - logs[:, :1])

@@ -1,0 +1,77 @@
+"""The model of success: boosted trees that give a grasp's log-odds of success, and how well they have kept their word.
+
+`scripts/train.py success` fits the model to trials of authored bodies. Trials of other families calibrate it.
+"""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.files import read_value
+
+MODEL, KIND = Path(__file__).with_name("model.safetensors"), "success-model"
+"""The shipped model, and the kind of its file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SuccessModel(Value):
+    """Boosted trees: t trees of m nodes, of which the first is the root. A leaf is its own child.
+
+    Args:
+        feature: the feature that a node reads.
+        threshold: a grasp goes to the first child where the feature is at most this.
+        children: the two children of each node.
+        value: the log-odds that a leaf adds; 0 in other nodes.
+        start: log-odds without any tree.
+        range: least and greatest value of each feature in the trials.
+        usual: the median of each feature among grasps that held.
+        bands: log-odds in ascending order, each with the least and greatest share of grasps that held there.
+        kept: trials of the best grasp for a task: log-odds, 1 if it held, and the number of the family.
+    """
+
+    feature: Int[Tensor, "t m"]
+    threshold: Float[Tensor, "t m"]
+    children: Int[Tensor, "t m 2"]
+    value: Float[Tensor, "t m"]
+    start: Float[Tensor, ""]
+    range: Float[Tensor, "k 2"]
+    usual: Float[Tensor, "k"]
+    bands: Float[Tensor, "n 3"]
+    kept: Float[Tensor, "r 3"]
+
+    def log_odds(self, features: Float[Tensor, "g k"]) -> Float[Tensor, "g"]:
+        """Return the log-odds of success of grasps with the given `FEATURES`."""
+        node = torch.zeros(len(features), len(self.feature), dtype=torch.int64, device=features.device)
+        trees = torch.arange(len(self.feature), device=features.device)
+        rows = torch.arange(len(features), device=features.device)[:, None]
+        for _ in range(self.depth):
+            above = features[rows, self.feature[trees, node]] > self.threshold[trees, node]
+            node = self.children[trees, node, above.long()]
+        return self.start + self.value[trees, node].sum(1)
+
+    @functools.cached_property
+    def depth(self) -> int:
+        """The number of steps from the root to the deepest leaf."""
+        reached, depth = torch.zeros(len(self.feature), 1, dtype=torch.int64, device=self.feature.device), 0
+        trees = torch.arange(len(self.feature), device=self.feature.device)[:, None]
+        while bool(((below := self.children[trees, reached].flatten(1)) != reached.repeat_interleave(2, 1)).any()):
+            reached, depth = below, depth + 1
+        return depth
+
+    def interval(self, log_odds: Float[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
+        """Return the bounds of the share of grasps with these log-odds that held, by linear interpolation."""
+        at, low_high = self.bands[:, 0].contiguous(), self.bands[:, 1:]
+        upper = torch.searchsorted(at, log_odds.to(at).contiguous()).clamp(1, len(at) - 1)
+        share = ((log_odds - at[upper - 1]) / (at[upper] - at[upper - 1])).clamp(0, 1)[..., None]
+        return torch.lerp(low_high[upper - 1], low_high[upper], share)
+
+
+@functools.cache
+def load_model(device: torch.device | str = "cpu") -> SuccessModel:
+    """Load the shipped model of success, in float64."""
+    return read_value(MODEL, KIND, SuccessModel)[0].to(device)

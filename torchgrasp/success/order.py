@@ -1,0 +1,66 @@
+"""The order of grasps: by predicted success for a task, or by the variance at the contacts as in the paper."""
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.errors import BadArgument, Status
+from torchgrasp.ik.ranking import lexical_order
+from torchgrasp.success.features import FEATURES
+from torchgrasp.success.model import load_model
+from torchgrasp.success.promise import find_promise
+from torchgrasp.values import Grasps
+
+DOMAIN = ("deviation", "size", "height", "friction", "mass", "force")
+"""Features that must be in the range of the trials for a prediction to be known."""
+
+
+def is_known(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
+    """Return a mask of the grasps whose predicted success is supported by trials: `DOMAIN` is in their range."""
+    rows = [FEATURES.index(name) for name in DOMAIN]
+    least, most = load_model(features.device).range[rows].T
+    return ((features[:, rows] >= least) & (features[:, rows] <= most)).all(1)
+
+
+def largest_known() -> float:
+    """Return the largest half size [m] (from centre to surface) of objects for which success is predicted."""
+    return float(load_model().range[FEATURES.index("size"), 1])
+
+
+def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]) -> Grasps:
+    """Set score, interval and `known` of the k executable grasps by their log-odds; return all grasps, best first."""
+    good, score = grasps.status == Status.OK, grasps.score.clone()
+    score[good] = log_odds.to(score)
+    interval, supported = torch.zeros_like(score)[:, None].repeat(1, 2), torch.ones_like(good)
+    bounds = load_model(log_odds.device).interval(log_odds).where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
+    interval[good], supported[good] = bounds.to(score), known
+    return by_success(dataclasses.replace(grasps, score=score, interval=interval, known=supported))
+
+
+def keep_promise(grasps: Grasps, share: float) -> Grasps:
+    """Give the status `NO_PROMISE` to executable grasps of which a `share` may not hold, and return all, best first."""
+    promise = find_promise(share)
+    least = math.inf if promise is None else promise.least
+    sure = grasps.score >= least if grasps.known is None else (grasps.score >= least) & grasps.known
+    broken = (grasps.status == Status.OK) & ~sure
+    return by_success(dataclasses.replace(grasps, status=grasps.status.masked_fill(broken, int(Status.NO_PROMISE))))
+
+
+def by_success(grasps: Grasps) -> Grasps:
+    """Sort grasps: executable ones with a known success, other executable ones, failed ones.
+
+    In each group the score falls; the greater margin of the certificate decides between equal scores.
+    """
+    late = 2 * (grasps.status != Status.OK).int()
+    late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()
+    return grasps[lexical_order(late, -grasps.score, -grasps.certificate.margin)]
+
+
+def rank_by_variance(grasps: Grasps) -> Grasps:
+    """Sort grasps: executable grasps first, then by increasing sum of the surface variances at contacts (Sec. 6.5)."""
+    if grasps.contacts.variance is None:
+        raise BadArgument("grasps.contacts.variance", "None", "the variance of the surface at each contact")
+    return grasps[lexical_order((grasps.status != Status.OK).int(), grasps.contacts.variance.sum(1))]
