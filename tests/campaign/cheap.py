@@ -52,7 +52,7 @@ def records(rng: torch.Generator, points: int, count: int, tries: int = TRIES) -
     status = torch.zeros(n, dtype=torch.int64)
     grasps = Grasps(
         draw(n, JOINTS), draw(n, JOINTS), draw(n, 3), pose, contacts, order, draw(n, f), draw(n), draw(n, f),
-        certificate, draw(n), status, known=status == 0,
+        certificate, draw(n), status, known=status == 0, interval=torch.zeros(n, 2, dtype=torch.float64),
     )  # fmt: skip
     passed = draw(n, tries) > 0.4
     outcome = torch.where(passed, int(Status.OK), int(Status.DROPPED))

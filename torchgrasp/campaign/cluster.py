@@ -65,7 +65,7 @@ def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str
 
 def _work(view: View, hand: Hand, protocol: Protocol, spec: EvaluationSpec) -> Shard:
     """Plan grasps on the view of a job, and try the chosen grasps in simulation."""
-    score, cloud, found = plan_view(view, protocol.trial.friction, spec)
+    score, cloud, found = plan_view(view, protocol, spec)
     row = JobRow(view.object, view.view, score.refusal, short(score.note), score.family, score.group)
     if cloud is None or found is None:
         return empty_shard(row, hand, protocol.noise.draws)

@@ -16,6 +16,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.specs import TrialSpec
+from torchgrasp.success.task import GraspTask
 from torchgrasp.values import Grasps
 
 if TYPE_CHECKING:
@@ -81,6 +82,18 @@ class Protocol(Value):
         if self.pull is not None and lifts != ("held", "before", 0.0, False, 1):
             found = "a pull with a criterion, displacement, push, second look or tries of a lift"
             raise BadArgument("pull", found, "None")
+
+    @property
+    def task(self) -> GraspTask:
+        """The task of the protocol's grasps, for which the planner predicts their success.
+
+        >>> find_protocol("dexgraspbench").task.describe()
+        'pulls of 0.1 kg with 7 N'
+        """
+        trial, lift = self.trial, self.pull is None
+        mass = trial.mass if self.pull is None else trial.mass * self.pull.acceleration / 10.0
+        closing = "open_loop" if trial.closing == "open_loop" and not lift else "uncertainty"
+        return GraspTask(max(mass, 1e-3), trial.force, lift, closing, self.noise.translation + self.noise.rotation > 0)
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":

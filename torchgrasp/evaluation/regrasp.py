@@ -25,10 +25,10 @@ from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.ik.ranking import log_odds_about
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Neighbour
 from torchgrasp.specs import TrialSpec
+from torchgrasp.success.loads import log_odds_about
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Grasps
 

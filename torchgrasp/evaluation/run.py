@@ -86,7 +86,7 @@ def _evaluate(
         shelf = stack.enter_context(temporary_folder()) if folder is None else Path(folder)
         if folder is not None and not spec.planned:  # grasps that are only read need no lock
             stack.enter_context(hold_folder(shelf))
-        plans = run_tasks(_plan, [(view, shelf, protocol.trial.friction, spec) for view in views], workers, PLAN_LIMIT)
+        plans = run_tasks(_plan, [(view, shelf, protocol, spec) for view in views], workers, PLAN_LIMIT)
         scores = [
             dataclasses.replace(view.score, seconds=math.nan, refusal=plan) if isinstance(plan, Status) else plan
             for view, plan in zip(views, plans, strict=True)
@@ -101,9 +101,9 @@ def _evaluate(
                 yield dataclasses.replace(score, attempts=tuple(attempts))
 
 
-def _plan(view: View, shelf: Path, friction: float, spec: EvaluationSpec) -> ViewScore:
+def _plan(view: View, shelf: Path, protocol: Protocol, spec: EvaluationSpec) -> ViewScore:
     """Plan grasps on a view and save them in the folder `shelf`, or count the grasps that an earlier call saved."""
-    found = plan_view(view, friction, spec, view.file(shelf) if spec.planned else None)
+    found = plan_view(view, protocol, spec, view.file(shelf) if spec.planned else None)
     if found.grasps is not None and not spec.planned:
         meta = found.grasps.meta | {REFUSAL: found.score.refusal.name}
         dataclasses.replace(found.grasps, meta=meta).save(view.file(shelf))

@@ -120,8 +120,8 @@ class PlannedView(NamedTuple):
     grasps: Grasps | None = None
 
 
-def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path | None = None) -> PlannedView:
-    """Plan grasps on a view, or read the grasps of an earlier call from the file `planned`."""
+def plan_view(view: View, protocol: Protocol, spec: EvaluationSpec, planned: Path | None = None) -> PlannedView:
+    """Plan grasps for a protocol on a view, or read the grasps of an earlier call from the file `planned`."""
     most_friction = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
     hand, score, started = view.load_hand(), view.score, time.process_time()
     try:
@@ -132,10 +132,10 @@ def plan_view(view: View, friction: float, spec: EvaluationSpec, planned: Path |
         if planned is not None:
             return _read_planned(planned, score, cloud, hand)
         started = time.process_time()
-        contacts = ContactSpec(friction=min(friction, most_friction), table=Plane.horizontal(0.0))
+        contacts = ContactSpec(friction=min(protocol.trial.friction, most_friction), table=Plane.horizontal(0.0))
         stages: dict[str, Any] = {}
         found = plan_grasps(
-            cloud, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers,
+            cloud, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers, task=protocol.task,
             observer=lambda name, _, value: stages.setdefault(name, value),
         )  # fmt: skip
     except (MissingExtra, OutputError):

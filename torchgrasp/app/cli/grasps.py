@@ -3,7 +3,7 @@
 import dataclasses
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import Command, Progress, arguments, naming, nested, option, positional
@@ -30,8 +30,10 @@ from torchgrasp.planner.scene import plan_scene
 from torchgrasp.scene import Scene, read_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.masks import label_again
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, TrialSpec
+from torchgrasp.success import GraspTask, explain_success
 from torchgrasp.values import PointCloud, format_success
 
 if TYPE_CHECKING:
@@ -67,6 +69,8 @@ class Grasp(Command):
     )
     view: inputs.CloudOptions = nested(inputs.CloudOptions())
     friction: float = option(0.8, "coefficient of friction between fingertips and object")
+    mass: float = option(0.25, "mass [kg] for which success is predicted, and with which the simulator lifts")
+    promise: float | None = option(None, "share of the grasps that must hold, such as 0.9; others are not returned")
     fingers: str = option(
         "default", f'{inputs.FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely to succeed'
     )
@@ -124,7 +128,7 @@ class Grasp(Command):
             origin += " (lowest point)" * (table is not None and view.table is None)
             camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
             progress.end("cloud", f"{len(cloud)} points, {camera}, {origin}")
-            options = {"fingers": among, "mode": self.mode, "observer": progress.end}
+            options = {"fingers": among, "mode": self.mode, "observer": progress.end, **self._task()}
             grasps = plan_grasps(cloud, hand, spec, self.starts, self.seed, **options, time_budget=self.time_budget)
             explanation = None
             if not bool((grasps.status == Status.OK).any()):
@@ -133,9 +137,10 @@ class Grasp(Command):
             surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
             stages = tuple(progress.stages)
             run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, explanation=explanation)
+            run = dataclasses.replace(run, costs=self._costs(run, progress.values["shape"]))
             if self.close and true_mesh is not None and len(run.executable):
                 felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
-                trial = TrialSpec(friction=self.friction)
+                trial = TrialSpec(friction=self.friction, mass=self.mass)
                 options = {"parts": parts, "table": plane, "surface": felt}
                 closure = close_hand(run.executable[0], hand, true_mesh, trial, seed=self.seed, **options)
                 progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
@@ -143,6 +148,17 @@ class Grasp(Command):
             progress.end("report", write_results(out, run, self.no_report))
         executable = print_grasps(run)
         return 0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
+
+    def _costs(self, run: Run, shape: ShapeGP) -> tuple[str, ...]:
+        """Return what lowers the predicted success of the best grasp most, in sentences."""
+        best = run.executable[:1]
+        return tuple(
+            x.sentence for grasp in best for x in explain_success(grasp, run.hand, shape, GraspTask(self.mass))
+        )
+
+    def _task(self) -> dict[str, Any]:
+        """Return the options of the planner that say what the grasps must do."""
+        return {"task": GraspTask(self.mass), "promise": self.promise}
 
     def _true_mesh(self, path: Path) -> Path | None:
         """Return the path of the true mesh, or None if there is none; raise `BadArgument` if --close has no mesh."""
@@ -169,7 +185,7 @@ class Grasp(Command):
             judged = Status.OK if scene.target is None else judge_things(scene, hand, spec)[scene.target]
             for sentence in (*scene.advice, *([judged.sentence] if judged is not Status.OK else [])):
                 print(f"advice  {sentence}")
-            options = {"fingers": among, "observer": progress.end}
+            options = {"fingers": among, "observer": progress.end, **self._task()}
             explanation = None
             if scene.target is not None:
                 grasps = plan_grasps(scene, hand, spec, self.starts, self.seed, **options)
@@ -185,6 +201,7 @@ class Grasp(Command):
             cloud, name, surface = take_target(scene, self.seed), f"object {scene.target}", extract_surface(shape)
             stages, plan = tuple(progress.stages), progress.values.get("plan")
             run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, None, None, scene, explanation)
+            run = dataclasses.replace(run, costs=self._costs(run, shape))
             progress.end("report", write_results(out, run, self.no_report))
         return 0 if print_grasps(run) else 1
 
@@ -211,7 +228,7 @@ class Grasp(Command):
     def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):
         """Plan for the objects of a scene until one is easy; return the scene with it as target, grasps and shape."""
         # An object with this predicted success is easy enough: the others are not tried.
-        plan = plan_scene(scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9)
+        plan = plan_scene(scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9, **self._task())
         for thing in plan.things:
             text = thing.reason or f"{0 if thing.grasps is None else len(thing.grasps)} executable grasps"
             print(format_line((f"object {thing.label}", format_success(thing.success), text), (-10, 7, -1)), flush=True)
@@ -238,6 +255,8 @@ def print_grasps(run: Run) -> bool:
     """Print the five best grasps and the verdict; return whether any grasp is executable."""
     if len(run.executable):
         print(f"\n{format_columns([GRASP_COLUMNS, *grasp_rows(run.executable, 5)])}\n")
+    for sentence in run.costs:
+        print(f"lowers success  {sentence}")
     print(verdict(run))
     return len(run.executable) > 0
 

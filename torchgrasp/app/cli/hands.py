@@ -21,7 +21,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.problem import finger_sets
+from torchgrasp.planner.request import finger_sets
 from torchgrasp.posture_model.dataset import write_samples
 from torchgrasp.posture_model.fit import Progress, fit_mixture
 from torchgrasp.posture_model.mixture import mixture_path

@@ -51,6 +51,7 @@ class Run:
         closure: result of closing on the true object; only with `mesh`.
         scene: the scene that the cloud was cut from.
         explanation: why no grasp is executable.
+        costs: what lowers the predicted success of the best grasp most.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -74,6 +75,7 @@ class Run:
     closure: ClosureResult | None = None
     scene: Scene | None = None
     explanation: Explanation | None = None
+    costs: tuple[str, ...] = ()
 
     @property
     def executable(self) -> Grasps:
