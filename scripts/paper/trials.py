@@ -26,12 +26,12 @@ from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.files import format_json, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.ik.ranking import rank_by_variance
 from torchgrasp.jobs import run_tasks
 from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.success.order import rank_by_variance
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 if TYPE_CHECKING:

@@ -27,6 +27,8 @@ FAMILIES = {
     if maker is not None
 }
 """Makers by family. A new one changes all bodies: the family of a body depends on their number."""
+CALIBRATING = frozenset(sorted(FAMILIES)[::3])
+"""Families that calibrate the model of success and support promises: no tree is fitted to their trials."""
 SEED = 46
 """Of all draws, beside the number of the body."""
 TOPPLED = {"can", "bottle", "flask", "jar", "turned", "cup", "mug", "goblet", "vase", "pitcher", "gable", "spray"}
@@ -62,9 +64,14 @@ def author_household(k: int) -> HouseholdBody:
     return HouseholdBody(f"{family}_{k}", family, mesh, parts)
 
 
+def family_of(k: int) -> str:
+    """Return the family of the k-th body."""
+    return list(FAMILIES)[k % len(FAMILIES)]
+
+
 def draw_thing(k: int) -> tuple[str, Thing]:
     """Return the family of the k-th body, and its solids [mm] before it comes to rest."""
-    family, draw = list(FAMILIES)[k % len(FAMILIES)], np.random.default_rng([SEED, k]).uniform
+    family, draw = family_of(k), np.random.default_rng([SEED, k]).uniform
     thing = FAMILIES[family](draw)
     return family, turn(thing, "x", 90 if family in TOPPLED and draw() < LYING else 0)
 

@@ -1,54 +1,164 @@
-"""Fit the model of predicted success, and show its calibration.
+"""Fit the model of predicted success to trials, calibrate it on families left out, and judge it there.
 
-Grasps of all ranks are planned on noisy views of authored bodies, pulled and lifted: closed in open loop and under
-uncertainty, at three frictions, with and without an error of the pose. One model is fitted to all trials, with a bias
-for each hand and one for errors of the pose. Each kind of body is judged by a fit without it. No scanned object is
-seen. The shipped weight of the load's force comes from lifts of scanned objects instead: see the model's file.
+`scripts/train.py trials` makes the trials. Two of three families fit boosted trees; more friction, more force and less
+load never lower their prediction. The other families calibrate it: they scale the log-odds, and give intervals. Their
+trials with `--best` choose the bounds of promises.
 """
 
-import json
+import dataclasses
 from pathlib import Path
 
+import numpy as np
 import torch
-from benchmarks.close.success import TESTS, describe, draw_reliability, fit, judge, leave_one_out, read_trials
+import tyro
+from numpy import ndarray as Array
+from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.linear_model import LogisticRegression
 
-from torchgrasp.files import format_json, write_file
-from torchgrasp.ik.ranking import FEATURES, MODEL
-from train.bodies import author_folder
+from torchgrasp.base import named_tensors
+from torchgrasp.evaluation import score
+from torchgrasp.files import save_tensors
+from torchgrasp.success.features import FEATURES
+from torchgrasp.success.model import KIND, MODEL, SuccessModel
+from train.household import CALIBRATING
+from train.measured import Trials, read_trials
+from train.trials import HANDS
+
+TREES = {
+    "max_iter": 100, "learning_rate": 0.05, "max_leaf_nodes": 8, "min_samples_leaf": 30, "l2_regularization": 5.0,
+    "max_features": 0.3, "random_state": 0, "early_stopping": False,
+}  # fmt: skip
+"""Parameters of the boosted trees; families left out of the fit chose them."""
+
+RISES = ("force to spare", "angle to spare", "angle to spare over tilt", "friction")
+FALLS = (
+    "force needed", "force needed at half friction", "angle needed", "mass", "displaced", "deviation", "tilt",
+)  # fmt: skip
+"""Features that never lower the prediction when they rise, or never raise it."""
+
+UNLIMITED = 1e9  # a bound that no feature reaches: files hold no infinity
+KNOTS, DRAWS = 12, 1000  # knots of the intervals, and how often their families are drawn anew
 
 
 def success(
-    hands: tuple[str, ...] = ("allegro", "barrett"),
-    grasps: int = 5,
-    workers: int | None = 1,
-    folder: Path = Path("out/success"),
-    model: Path = MODEL,
+    folders: tyro.conf.Positional[tuple[Path, ...]], best: tuple[Path, ...] = (), workers: int = 1, model: Path = MODEL
 ) -> None:
-    """Run the missing trials, fit the model of predicted success, judge it and write it.
+    """Fit the model of predicted success to data sets of trials, judge it on families left out, and write it.
 
     Args:
-        hands: names of hands.
-        grasps: grasps of each body, spread over all ranks.
-        workers: processes; None: nothing is run, the trials that are there are fitted anew, as after a change of the
-            shape.
-        folder: where bodies, grasps, trials and the reliability diagram go; trials found there are not run again.
+        folders: of `scripts/train.py trials`.
+        best: of the same with `--best`, after a fit to the same folders; without one the model makes no promise.
+        workers: processes that measure the grasps; the features are kept in the folders.
         model: file of the model.
     """
     torch.set_num_threads(1)
-    author_folder(folder / "authored")
-    trials = read_trials(folder / "authored", hands, grasps, workers, folder)
-    unseen = leave_one_out(trials)
-    print(*judge(unseen, trials), sep="\n")
-    draw_reliability(folder / "reliability.png", unseen, trials)
-    fitted, said = fit(trials), describe(unseen, trials)
-    bodies, passed = len(set(trials.object)), trials.passed.mean()
-    content = {
-        "weights": dict(zip(FEATURES, fitted.weights.tolist(), strict=True)),
-        "bias": fitted.bias,
-        "pose_error": fitted.pose_error,
-        **{key: json.loads(model.read_text("utf-8"))[key] for key in ("range", "range_from")},  # not fitted here
-        "fitted_on": f"{len(trials.passed)} trials of {bodies} authored bodies, {passed:.0%} passed",
-        "trial": "torchgrasp.evaluation.pull: " + "; ".join(", ".join(test) for test in TESTS),
-        "on_kinds_of_bodies_left_out": {name: round(said[name], 4) for name in ("brier", "skill", "auc", "error")},
-    }
-    print(write_file(model, format_json(content) + "\n"))
+    trials = read_trials([folder / hand for folder in folders for hand in HANDS], workers)
+    left = np.isin(trials.family, list(CALIBRATING))
+    fitted = fit_model(trials, left)
+    print(*judge(fitted, trials.select(left)), sep="\n")
+    about = {"fitted_on": f"{(~left).sum()} trials", "calibrated_on": f"{left.sum()} trials of other families"}
+    if best:
+        tried = read_trials([folder / hand for folder in best for hand in HANDS], workers)
+        fitted = dataclasses.replace(fitted, kept=keep_trials(fitted, tried))
+        print("best grasps:", *judge(fitted, tried), sep="\n")
+        about["promised_on"] = f"{len(tried.passed)} trials of best grasps"
+    print(save_tensors(model, KIND, named_tensors(fitted), about))
+
+
+def fit_model(trials: Trials, left: Array) -> SuccessModel:
+    """Return the model, without promises; the mask `left` tells which trials calibrate it and fit no tree."""
+    trees = HistGradientBoostingClassifier(**TREES, monotonic_cst=[directions().get(name, 0) for name in FEATURES])
+    trees.fit(trials.features[~left], trials.passed[~left])
+    others, fitted = trials.select(left), read_trees(trees)
+    raw = fitted.log_odds(torch.from_numpy(others.features)).numpy()
+    platt = LogisticRegression(C=np.inf).fit(raw[:, None], others.passed)
+    slope, shift = float(platt.coef_[0, 0]), float(platt.intercept_[0])
+    bands = find_bands(slope * raw + shift, others.passed, others.family)
+    held = trials.features[trials.passed]
+    return SuccessModel(
+        fitted.feature, fitted.threshold, fitted.children, slope * fitted.value, slope * fitted.start + shift,
+        torch.from_numpy(find_range(trials.features)),
+        torch.from_numpy(np.median(held, 0)),
+        torch.from_numpy(bands), torch.zeros(0, 3, dtype=torch.float64),
+    )  # fmt: skip
+
+
+def keep_trials(model: SuccessModel, tried: Trials) -> torch.Tensor:
+    """Return rows of log-odds, whether the grasp held, and the number of the family."""
+    odds = model.log_odds(torch.from_numpy(tried.features)).numpy()
+    family = np.unique(tried.family, return_inverse=True)[1]
+    return torch.from_numpy(np.stack([odds, tried.passed, family], -1))
+
+
+def find_range(features: Array) -> Array:
+    """Return least and greatest value of each feature; on the side on which grasps hold better there is no limit."""
+    found = np.stack([features.min(0), features.max(0)], -1)
+    for name, direction in directions().items():
+        found[FEATURES.index(name), (direction + 1) // 2] = direction * UNLIMITED
+    return found
+
+
+def directions() -> dict[str, int]:
+    """Return the direction in which the prediction may change with a feature."""
+    return {name: 1 for name in RISES} | {name: -1 for name in FALLS}
+
+
+def read_trees(trees: HistGradientBoostingClassifier) -> SuccessModel:
+    """Return the trees of scikit-learn as tensors, without calibration."""
+    nodes = [predictor[0].nodes for predictor in trees._predictors]  # pyright: ignore
+    shape = len(nodes), max(map(len, nodes))
+    feature, own = np.zeros(shape, dtype=np.int64), np.tile(np.arange(shape[1]), (shape[0], 1))
+    threshold, children, value = np.zeros(shape), np.stack([own, own], -1), np.zeros(shape)
+    for k, tree in enumerate(nodes):
+        leaf, n = tree["is_leaf"].astype(bool), len(tree)
+        feature[k, :n] = np.where(leaf, 0, tree["feature_idx"])
+        threshold[k, :n] = np.where(leaf, 0.0, tree["num_threshold"])
+        for side, name in enumerate(("left", "right")):
+            children[k, :n, side] = np.where(leaf, own[k, :n], tree[name])
+        value[k, :n] = np.where(leaf, tree["value"], 0.0)
+    start = torch.tensor(float(trees._baseline_prediction.item()), dtype=torch.float64)  # pyright: ignore
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    tensors = [torch.from_numpy(x) for x in (feature, threshold, children, value)]
+    return SuccessModel(*tensors, start, none[:, :2], none[:, 0], none, none)
+
+
+def find_bands(odds: Array, passed: Array, family: Array, seed: int = 0) -> Array:
+    """Return rows of log-odds, and the 95 % interval of the share that held there, from families drawn anew."""
+    edges = np.quantile(odds, np.linspace(0, 1, KNOTS + 1))
+    bins = np.clip(np.searchsorted(edges, odds, side="right") - 1, 0, KNOTS - 1)
+    middle = np.array([odds[bins == b].mean() for b in range(KNOTS)])
+    members = [np.flatnonzero(family == name) for name in np.unique(family)]
+    draw, shares = np.random.default_rng(seed), np.full((DRAWS, KNOTS), np.nan)
+    for k in range(DRAWS):
+        rows = np.concatenate([members[i] for i in draw.integers(len(members), size=len(members))])
+        total = np.bincount(bins[rows], minlength=KNOTS)
+        shares[k] = (np.bincount(bins[rows], passed[rows], KNOTS) + 0.5) / (total + 1)
+    low, high = np.nanquantile(shares, (0.025, 0.975), axis=0)
+    return np.stack([middle, np.maximum.accumulate(low), np.maximum.accumulate(high)], -1)
+
+
+def judge(model: SuccessModel, trials: Trials) -> list[str]:
+    """Return what is to be said of the model's predictions: of all trials, and of each group."""
+    p = torch.sigmoid(model.log_odds(torch.from_numpy(trials.features)))
+    columns = dict(zip(FEATURES, trials.features.T, strict=True))
+    groups = {
+        "all": np.ones(len(p), dtype=bool), "20 best": trials.rank < 20, "lifts": columns["lifted"] > 0,
+        "pulls": columns["lifted"] == 0, "best of its body": trials.is_best(model),
+        **{hand: trials.hand == hand for hand in HANDS},
+        **{f"friction {a:g} to {b:g}": (columns["friction"] >= a) & (columns["friction"] < b)
+           for a, b in ((0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.01))},
+        **{f"{a:g} to {b:g} kg": (columns["mass"] >= a) & (columns["mass"] < b)
+           for a, b in ((0.02, 0.05), (0.05, 0.1), (0.1, 0.25), (0.25, 0.5), (0.5, 1.01))},
+    }  # fmt: skip
+    lines = []
+    for name, rows in groups.items():
+        if rows.sum() < 2 or len(np.unique(trials.passed[rows])) < 2:
+            continue
+        said = score.judge(
+            p[torch.from_numpy(rows)], torch.from_numpy(trials.passed[rows]), trials.family[rows].tolist()
+        )
+        lines.append(
+            f"{name}: predicted {said['predicted']:.2f}, passed {said['passed']:.2f} of {rows.sum()}; "
+            f"AUC {said['auc']:.3f}, ECE {said['error']:.3f}, Brier skill {said['skill']:.2f}"
+        )
+    return lines

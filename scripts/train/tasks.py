@@ -10,9 +10,13 @@ from torchgrasp.base import Value
 from torchgrasp.evaluation import PROTOCOLS, PoseNoise, Protocol
 from torchgrasp.evaluation.protocols import POSE_NOISE
 from torchgrasp.specs import ClosingMode
+from torchgrasp.success.task import GraspTask
 
 FRICTION, MASS, FORCE = (0.2, 1.0), (0.02, 1.0), (2.0, 10.0)
 """Least and greatest friction, mass [kg] (even in its logarithm) and force [N] of the strongest finger."""
+
+ORDINARY_FRICTION, ORDINARY_MASS, ORDINARY_FORCE = (0.3, 1.0), (0.02, 0.25), (4.0, 10.0)
+"""The same of the tasks for which a promise is made."""
 
 PULL, LIFT = PROTOCOLS["dexgraspbench"], PROTOCOLS["table-lift"]
 
@@ -40,6 +44,16 @@ class Task(Value):
     force: float | None
     errs: bool
 
+    def pressing(self, force: float) -> "Task":
+        """Return the task with another force [N], unless the hand grips."""
+        return self if self.force is None else dataclasses.replace(self, force=force)
+
+    @property
+    def known(self) -> GraspTask:
+        """The task as the planner knows it."""
+        closing = "open_loop" if self.closing == "open_loop" else "uncertainty"
+        return GraspTask(self.mass, self.force, self.lift, closing, self.errs)
+
     @property
     def protocol(self) -> Protocol:
         """The protocol of the trial, in MuJoCo.
@@ -56,6 +70,17 @@ class Task(Value):
         noise = error if self.errs else PoseNoise()
         found = dataclasses.replace(base, noise=noise, tries=1, criterion="held")
         return found.with_trial(**changes, force=self.force, simulator="mujoco")
+
+
+def draw_ordinary(draw: np.random.Generator, planned: float) -> Task:
+    """Draw the task of a grasp for which a promise is made: at the planned friction, where the planner saw the object.
+
+    >>> draw_ordinary(np.random.default_rng(0), 0.6).mass <= ORDINARY_MASS[1]
+    True
+    """
+    mass = round(math.exp(draw.uniform(*np.log(ORDINARY_MASS))), 4)
+    force = round(float(draw.uniform(*ORDINARY_FORCE)), 3)
+    return dataclasses.replace(draw_task(draw, planned), friction=planned, mass=mass, errs=False).pressing(force)
 
 
 def draw_task(draw: np.random.Generator, planned: float) -> Task:

@@ -2,6 +2,8 @@
 
 One job is one body and one hand. It is planned on from a noisy view and its grasps are tried in MuJoCo. The jobs of a
 hand are a campaign (`torchgrasp.campaign`): the same call continues an interrupted run. Tasks are kept as metadata.
+
+For promises, the best grasp for each of a few ordinary tasks is tried instead, on families that fit no model.
 """
 
 import dataclasses
@@ -25,18 +27,22 @@ from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.trial import GraspTrial, Truth
-from torchgrasp.files import write_file
+from torchgrasp.files import sha256, write_file
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_as_they_end
 from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.surface import surface_field
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import extract_mesh, surface_field
 from torchgrasp.specs import ContactSpec
+from torchgrasp.success.features import measure_grasps
+from torchgrasp.success.model import MODEL, load_model
+from torchgrasp.success.order import is_known
 from torchgrasp.values import Grasps, PointCloud
-from train.household import FAMILIES, HouseholdBody, author_household
-from train.tasks import FRICTION, PULL, Task, draw_task
+from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
+from train.tasks import FRICTION, ORDINARY_FRICTION, PULL, Task, draw_ordinary, draw_task
 
 HANDS = ("allegro", "barrett", "leap", "shadow")
 """Hands of the trials; each body is tried with one of them."""
@@ -46,6 +52,9 @@ SENSORS: tuple[bool | SensorName, ...] = (True, "realsense", "kinect_v1", "azure
 
 STARTS, BEST, SPREAD = 400, 6, 6
 """Random starts of the planner; grasps tried of the twenty best ones, and of those that follow."""
+
+TASKS = 3
+"""Ordinary tasks of a body, for each of which its best grasp is tried."""
 
 LIMIT = 1800.0
 """Wall time [s] of one job."""
@@ -82,6 +91,7 @@ def trials(
     workers: int | str = 1,
     hands: tuple[str, ...] = HANDS,
     first: int = 0,
+    best: bool = False,
 ) -> None:
     """Try grasps of all hands on household bodies; what is in the folder is not run again.
 
@@ -91,22 +101,25 @@ def trials(
         workers: number of processes, or the address of a Dask scheduler.
         hands: whose share is tried.
         first: number of the first body, so that more bodies can follow in a folder of their own.
+        best: try the best grasp for ordinary tasks, on bodies of the families that calibrate the model.
     """
     for hand in hands:
-        counts = run_trials(hand, bodies, folder, workers, first=first).card["counts"]
+        counts = run_trials(hand, bodies, folder, workers, first=first, best=best).card["counts"]
         print(f"{hand}: {counts['tries']} trials on {counts['objects']} bodies, {counts['passed']} passed")
 
 
 def run_trials(
-    hand: str, bodies: int, folder: Path, workers: int | str = 1, seed: int = 0, first: int = 0
+    hand: str, bodies: int, folder: Path, workers: int | str = 1, seed: int = 0, first: int = 0, best: bool = False
 ) -> GraspShards:
     """Try grasps of one hand on its share of some bodies from the `first` on, and return the data set."""
-    numbers = range(first, first + bodies)
-    numbers = [k for k in numbers if k % len(HANDS) == HANDS.index(hand)]
+    among = range(first, first + bodies)
+    numbers = [k for k in among if k % len(HANDS) == HANDS.index(hand) and (not best or family_of(k) in CALIBRATING)]
     model = load_hand(hand)
     of_hand = {"name": hand, "option": model.source.option, "sha256": model.source.sha256}
     of_hand |= {"joint_names": ", ".join(model.joint_names), "finger_names": ", ".join(model.finger_names)}
     trials = {"grasps": BEST + SPREAD, "ranks": "best and spread", "starts": STARTS, "seed": seed}
+    if best:
+        trials |= {"grasps": TASKS, "ranks": "best", "model_sha256": sha256(MODEL)}
     asked = {
         "torchgrasp": "campaign", "version": 1, "licence": "MIT", "hand": of_hand, "trials": trials,
         "protocol": dataclasses.asdict(PULL), "tasks": "drawn for each trial: train/tasks.py", "bodies": len(numbers),
@@ -116,7 +129,7 @@ def run_trials(
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, model, 1))
 
     def work(places: Sequence[int]) -> Generator[tuple[int, bytes | Status], None, None]:
-        tasks = [(hand, numbers[place], seed, campaign.meta) for place in places]
+        tasks = [(hand, numbers[place], seed, campaign.meta, best) for place in places]
         run = run_on_cluster if isinstance(workers, str) else run_as_they_end
         return run(try_body, tasks, workers, LIMIT)  # pyright: ignore[reportArgumentType]
 
@@ -130,23 +143,24 @@ def run_trials(
     return data
 
 
-def try_body(hand: str, k: int, seed: int, meta: dict[str, str]) -> bytes:
+def try_body(hand: str, k: int, seed: int, meta: dict[str, str], best: bool = False) -> bytes:
     """Plan on one view of a body, try its grasps, and return the bytes of a shard with this job alone."""
     check_versions(meta)
     model, body = load_hand(hand), author_household(k)
     draw = np.random.default_rng([seed, k])
     row = JobRow(f"body{k:05d}", "view0", family=body.family)
     try:
-        shard = _try_body(model, body, draw, row, seed_of(seed, k))
+        shard = _try_body(model, body, draw, row, seed_of(seed, k), best)
     except GraspError as error:  # as a body that the camera does not see
         row = row._replace(status=Status.BAD_OBJECT, note=short(f"{type(error).__name__}: {error}"))
         shard = empty_shard(row, model, 1)
     return pack_shard(shard, meta)
 
 
-def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: JobRow, seed: int) -> Shard:
+def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: JobRow, seed: int, best: bool) -> Shard:
     azimuth, elevation = draw.uniform(0.0, 360.0), draw.uniform(15.0, 60.0)
-    sensor, friction = SENSORS[draw.integers(len(SENSORS))], round(float(draw.uniform(*FRICTION)), 3)
+    sensor = SENSORS[draw.integers(len(SENSORS))]
+    friction = round(float(draw.uniform(*(ORDINARY_FRICTION if best else FRICTION))), 3)
     camera = look_at(azimuth, elevation, target=body.mesh)
     cloud, table = partial_view(body.mesh, camera, noise=sensor, seed=seed), Plane.horizontal(0.0)
     eye = cloud.viewpoint.double()[None]  # pyright: ignore[reportOptionalMemberAccess]
@@ -157,21 +171,33 @@ def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: J
         row = row._replace(status=Status(int(found.status.mode().values)) if len(found) else Status.OUT_OF_REACH)
         empty = empty_shard(row, hand, 1).records
         return Shard((row,), dataclasses.replace(empty, points=cloud.points.double(), viewpoints=eye))
-    ranks = choose_ranks(len(executable), draw)
-    surface, tasks, results = surface_field(fit_shape(cloud, table=table)), [], []
-    for rank in ranks:
-        grasp, own = executable[rank], seed_of(seed, rank)
-        tasks.append(draw_task(draw, friction))
-        error = draw_error(tasks[-1].protocol, grasp, body.mesh, own)
+    shape = fit_shape(cloud, table=table)
+    if best:
+        tasks = [draw_ordinary(draw, friction) for _ in range(TASKS)]
+        ranks = [best_for(task, hand, shape, executable) for task in tasks]
+    else:
+        ranks = choose_ranks(len(executable), draw)
+        tasks = [draw_task(draw, friction) for _ in ranks]
+    surface, results = surface_field(shape), []
+    for number, (rank, task) in enumerate(zip(ranks, tasks, strict=True)):
+        grasp, own = executable[rank], seed_of(seed, number if best else rank)
+        error = draw_error(task.protocol, grasp, body.mesh, own)
         truth = Truth(body.mesh, body.parts, error)
-        trial = GraspTrial(hand, grasp, truth, seed_of(own, "touch"), surface=surface if tasks[-1].lift else None)
-        results.append(run_protocol(trial, tasks[-1].protocol, rank))
+        trial = GraspTrial(hand, grasp, truth, seed_of(own, "touch"), surface=surface if task.lift else None)
+        results.append(run_protocol(trial, task.protocol, rank))
     passed = torch.tensor([[x.passed] for x in results])
     outcome = torch.tensor([[int(x.status)] for x in results])
     said = json.dumps([dataclasses.asdict(task) for task in tasks])
     meta = executable.meta | row.meta | {"tasks": said, "ranks": json.dumps(ranks), "friction": str(friction)}
     row = row._replace(grasps=len(ranks), passed=int(passed.sum()), meta=meta)
     return Shard((row,), Records(cloud.points.double(), eye, executable[ranks], passed, outcome))
+
+
+def best_for(task: Task, hand: Hand, shape: ShapeGP, grasps: Grasps) -> int:
+    """Return the index of the grasp that most likely holds a task."""
+    vertices = extract_mesh(shape).vertices
+    features = measure_grasps(hand, shape, vertices, grasps, task.friction, task.known, task.lift)
+    return int(load_model().log_odds(features).where(is_known(features), -torch.inf).argmax())
 
 
 def choose_ranks(executable: int, draw: np.random.Generator) -> list[int]:

@@ -9,10 +9,13 @@ pytest.importorskip("manifold3d")
 pytest.importorskip("mujoco")
 
 from train import trials as runner
-from train.tasks import FORCE, FRICTION, MASS, Task, draw_task
+from train.household import CALIBRATING, FAMILIES, family_of
+from train.measured import read_trials
+from train.tasks import FORCE, FRICTION, MASS, Task, draw_ordinary, draw_task
 from train.trials import choose_ranks, read_rows, run_trials
 
 from torchgrasp.errors import Status
+from torchgrasp.success.features import FEATURES
 
 
 def test_tasks_lie_within_their_bounds_and_half_keep_the_planned_friction():
@@ -43,6 +46,27 @@ def test_ranks_are_of_the_best_and_of_the_rest():
     assert len(ranks) == runner.BEST + runner.SPREAD and max(ranks) < 100
 
 
+def test_ordinary_tasks_are_lighter_and_keep_the_planned_friction():
+    draw = np.random.default_rng(0)
+    tasks = [draw_ordinary(draw, 0.7) for _ in range(200)]
+    assert all(x.friction == 0.7 and not x.errs and MASS[0] <= x.mass <= 0.25 for x in tasks)
+    assert all(x.force is None or x.force >= 4.0 for x in tasks)
+    known = [x.known for x in tasks]
+    assert [(x.mass, x.lift, x.displaced) for x in known] == [(x.mass, x.lift, x.errs) for x in tasks]
+
+
+@pytest.mark.sim
+def test_the_best_grasp_is_tried_for_each_ordinary_task_on_families_that_calibrate(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "STARTS", 20)
+    monkeypatch.setattr(runner, "TASKS", 1)
+    number = next(k for k in range(0, 400, 4) if family_of(k) in CALIBRATING)
+    data = run_trials("allegro", 4, tmp_path, 0, first=number, best=True)
+    assert len(data.jobs) == 1 and data.jobs[0].family in CALIBRATING and data.jobs[0].grasps <= 1
+    assert not len(
+        run_trials("allegro", 4, tmp_path / "other", 0, first=number + 4 * len(FAMILIES) + 1, best=True).jobs
+    )
+
+
 @pytest.mark.sim
 def test_trials_are_kept_and_read_with_their_tasks(tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "STARTS", 20)
@@ -53,6 +77,10 @@ def test_trials_are_kept_and_read_with_their_tasks(tmp_path, monkeypatch):
     assert (row.object, row.status, trial.status in Status) == ("body00000", Status.OK, True)
     assert len(cloud) == row.points and len(grasps) == 1 and trial.rank < 20
     assert json.loads(grasps.meta["ranks"]) == [trial.rank]
+    measured = read_trials([tmp_path / "allegro"])
+    assert (measured.passed.tolist(), measured.rank.tolist()) == ([trial.passed], [trial.rank])
+    columns = dict(zip(FEATURES, measured.features[0], strict=True))
+    assert (columns["friction"], columns["mass"]) == (trial.task.friction, trial.task.mass)
     again = run_trials("allegro", 1, tmp_path / "again", 0)
     assert (tmp_path / "again" / "allegro" / "shard-000000.safetensors").read_bytes() == (
         tmp_path / "allegro" / "shard-000000.safetensors"

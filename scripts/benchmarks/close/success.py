@@ -1,255 +1,185 @@
-"""Whether predicted success is true: trials of grasps of all ranks on objects that the shipped model has not seen."""
+"""Whether predicted success is true, whether the best grasp is the best, and whether a promise is kept.
 
-import json
-import math
-from collections.abc import Sequence
-from pathlib import Path
+Objects that the model of success was not fitted on are planned on at three frictions, each with a mass of its own. The
+20 best grasps and some that follow are pulled at by protocol "dexgraspbench".
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from sklearn.linear_model import LogisticRegression
-from sklearn.preprocessing import StandardScaler
-from tqdm import tqdm
+from paper.trials import Subject, TableSpec, subjects
 
-from benchmarks.common import Options, Row, bench
-from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
+from benchmarks.close.campaign import folder_of, keep, read_solid, run_all, table_spec
+from benchmarks.common import Options, Row, bench, mean_over
+from torchgrasp.data import read_view
 from torchgrasp.errors import Status
 from torchgrasp.evaluation import score
-from torchgrasp.evaluation.protocols import PROTOCOLS, draw_error, seed_of
+from torchgrasp.evaluation.intervals import Share, count_by, format_share, share_over
+from torchgrasp.evaluation.protocols import PROTOCOLS, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.evaluation.views import choose_rows
-from torchgrasp.files import format_json, write_file
+from torchgrasp.files import sha256
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
-from torchgrasp.ik.ranking import FEATURES, MODEL, success_features
-from torchgrasp.jobs import run_tasks
 from torchgrasp.planner import plan_grasps
-from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.surface import extract_surface
-from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ClosingMode, ContactSpec
-from torchgrasp.values import load_grasps
+from torchgrasp.specs import ContactSpec
+from torchgrasp.success.model import MODEL
+from torchgrasp.success.promise import find_promise
 
-TESTS: tuple[tuple[str, ClosingMode], ...] = (
-    ("dexgraspbench", "open_loop"),
-    ("dexgraspbench", "uncertainty"),
-    ("dexgraspbench-hard", "open_loop"),
-    ("dexgraspbench-hard", "uncertainty"),
-    ("pose-noise", "uncertainty"),
-    ("table-lift", "uncertainty"),
-)
-"""Protocols, of friction 0.8 to 0.3, and closings of the trials: what an executed grasp may meet. Every grasp is put
-to the first and, in turn, to one of the others. A lift has to hold the object without slip."""
-
-FRICTION = 0.6
-"""At which grasps are planned: that of the first test."""
-
-STARTS = 400
-"""Random starts of the contact planner: planning takes half as long as with 1000."""
-
-LIMIT = 3600.0
-"""Wall time [s] that the trials of one object may take."""
-
-PENALTY = 1.0
-"""Inverse of the weight of the squared coefficients, of standardised features."""
-
-ENOUGH, NEAR = 20, 0.08
-"""Trials from which on a bin is judged, and how near the share that passed must then be to the prediction."""
+FRICTIONS, MASSES = (0.3, 0.6, 0.8), (0.05, 0.1, 0.25)
+"""Coefficients of friction, and masses [kg] that take turns with them."""
+BEST, OTHERS = 20, 4
+"""Best grasps that are tried of each plan, and grasps tried of those that follow."""
+SHARE = 0.9
+"""Share of held grasps that is promised."""
+ENOUGH = 100
+"""Trials from which on a group is judged."""
 
 
-class Trials(NamedTuple):
-    """Trials of grasps: `features` (n, k), whether each `passed`, and of which object, family, hand and test."""
+class Cell(NamedTuple):
+    """One plan: object, family, group, hand, friction, mass [kg], executable grasps, and what was tried.
 
-    features: np.ndarray
-    passed: np.ndarray
-    object: np.ndarray
-    family: np.ndarray
-    hand: np.ndarray
-    test: np.ndarray
+    `tried` holds the rank, the predicted success, and whether the grasp passed.
+    """
 
-    def select(self, rows: np.ndarray) -> "Trials":
-        """Return some of the trials, by a mask."""
-        return Trials(*(column[rows] for column in self))
+    object: str
+    family: str
+    group: str
+    hand: str
+    friction: float
+    mass: float
+    executable: int
+    tried: list[tuple[int, float, bool]]
 
-
-class SuccessModel(NamedTuple):
-    """Weights of the features, a bias for each hand, and what an error of the hand's pose adds."""
-
-    weights: np.ndarray
-    bias: dict[str, float]
-    pose_error: float
-
-    @classmethod
-    def shipped(cls) -> "SuccessModel":
-        """Return the model that ranks grasps."""
-        model = json.loads(MODEL.read_text("utf-8"))
-        return cls(np.array([model["weights"][name] for name in FEATURES]), model["bias"], model["pose_error"])
-
-    def predict(self, trials: Trials) -> np.ndarray:
-        """Return the probability of each trial."""
-        bias = np.array([self.bias[name] for name in trials.hand.tolist()])
-        return 1 / (1 + np.exp(-(trials.features @ self.weights + bias + self.pose_error * beside_plan(trials))))
-
-
-def beside_plan(trials: Trials) -> np.ndarray:
-    """Tell which trials had an error of the hand's pose."""
-    return np.char.startswith(trials.test, "pose-noise")
+    @property
+    def best(self) -> list[tuple[int, float, bool]]:
+        """The grasps that were tried of the 20 best."""
+        return [x for x in self.tried if x[0] < BEST]
 
 
 @bench("close/success", objects=True)
 def success(o: Options) -> list[Row]:
-    """Judge the shipped model on the objects of a folder, none of which it was fitted on."""
-    hands, folder = o.hands, o.out / "success"
-    trials, rows = read_trials(o.objects[0], hands, o.grasps, o.workers, folder), []
-    predicted = SuccessModel.shipped().predict(trials)
-    for hand in hands:
-        mine = trials.hand == hand
-        said = describe(predicted[mine], trials.select(mine))
-        bins = [x for x in said["bins"] if x.passed.total >= ENOUGH]
-        off = max((abs(x.predicted - x.passed.value) for x in bins), default=math.nan)
-        skill, order, error = (float(said[name]) for name in ("skill", "auc", "error"))
-        rows += [
-            Row(f"{hand}: Brier skill, objects not fitted on", ">= 0.30", f"{skill:.2f}", skill >= 0.3, said),
-            Row(f"{hand}: area under the curve", ">= 0.85", f"{order:.2f}", order >= 0.85, {}),
-            Row(f"{hand}: expected calibration error", "<= 0.05", f"{error:.2f}", error <= 0.05, {}),
-            Row(f"{hand}: {len(bins)} bins of {ENOUGH} trials", f"within {NEAR:.2f}", f"{off:.2f}", off <= NEAR, {}),
-        ]
-    draw_reliability(folder / "reliability.png", predicted, trials)
-    print(*judge(predicted, trials), sep="\n")
+    """Pull at grasps of objects that the model was not fitted on, and judge their prediction, order and promise."""
+    spec = dataclasses.replace(table_spec(o), representatives=False)
+    named = list(enumerate(subjects(spec)))
+    tasks = [
+        (spec, subject, hand, friction, MASSES[(i + j) % len(MASSES)], o.simulator)
+        for (i, subject), hand, (j, friction) in itertools.product(named, o.hands, enumerate(FRICTIONS))
+    ]
+    cells = [Cell(*found) for found in run_all(try_object, tasks, spec.workers)]
+    planned = [cell for cell in cells if cell.tried]
+    return [
+        Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}", None, {}),
+        *judge_predictions(planned),
+        *judge_order(planned),
+        *judge_promise(planned),
+    ]
+
+
+def try_object(
+    spec: TableSpec, subject: Subject, hand: str, friction: float, mass: float, simulator: str
+) -> tuple[Any, ...]:
+    """Plan on the first view of an object, and pull at grasps of its plan; a kept result is read."""
+    about = (subject.label, subject.family, subject.group, hand, friction, mass)
+    asked = friction, mass, simulator, sha256(MODEL)[:12]
+    path = spec.kept("success", f"{hand}_{subject.label}", *asked).with_suffix(".json")
+    executable, tried = keep(path, lambda: pull_at(spec, subject, hand, friction, mass, simulator))
+    return *about, executable, tried
+
+
+def pull_at(
+    spec: TableSpec, subject: Subject, hand: str, friction: float, mass: float, simulator: str
+) -> tuple[int, list[tuple[int, float, bool]]]:
+    """Return the number of executable grasps of a plan, and what became of those that were tried."""
+    base, model, solid = PROTOCOLS["dexgraspbench"], load_hand(hand), read_solid(subject)
+    patch = base.trial.patch * base.trial.friction / friction
+    protocol = base.with_trial(friction=friction, mass=mass, patch=patch, simulator=simulator)
+    cloud = read_view(folder_of(subject), subject.name, solid.view)
+    contacts = ContactSpec(friction, table=Plane.horizontal(0.0))
+    grasps = plan_grasps(cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
+    good = grasps[grasps.status == Status.OK]
+    rest = [BEST + k for k in choose_rows(len(good) - BEST, OTHERS, "spread")] if len(good) > BEST else []
+    tried = list[tuple[int, float, bool]]()
+    for rank in (*range(min(BEST, len(good))), *rest):
+        trial = GraspTrial(model, good[rank], Truth(solid.mesh, solid.parts), seed_of(spec.seed, subject.label, rank))
+        tried.append((rank, float(torch.sigmoid(good.score[rank])), run_protocol(trial, protocol, rank).passed))
+    return len(good), tried
+
+
+def judge_predictions(cells: list[Cell]) -> list[Row]:
+    """Return the area under the curve, and the errors of calibration of all trials and of each group."""
+    groups = {"all": cells, **group_cells(cells)}
+    rows = list[Row]()
+    for name, mine in groups.items():
+        trials = [(cell.family, *x) for cell in mine for x in cell.tried]
+        if len(trials) < ENOUGH:
+            continue
+        said, bar = judge_trials(trials), 0.04 if name == "all" else 0.08
+        text = f"{said['error']:.3f} of {len(trials)}: predicted {said['predicted']:.2f}, passed {said['passed']:.2f}"
+        rows.append(Row(f"calibration error, {name}", f"<= {bar}", text, said["error"] <= bar, said))
+    every = judge_trials([(cell.family, *x) for cell in cells for x in cell.tried])
+    best = judge_trials([(cell.family, *x) for cell in cells for x in cell.best])
+    for name, said, bar in (("20 best", best, 0.8), ("all ranks", every, 0.88)):
+        rows.append(Row(f"area under the curve, {name}", f">= {bar}", f"{said['auc']:.3f}", said["auc"] >= bar, {}))
+    bins = [f"{x.predicted:.2f}: {format_share(x.passed)}" for x in every["bins"]]
+    return [*rows, Row("predicted and passed", "-", "; ".join(bins), None, {})]
+
+
+def judge_trials(trials: Iterable[tuple[str, int, float, bool]]) -> dict[str, Any]:
+    """Return what `score.judge` says of trials: family, rank, prediction, and whether the grasp passed."""
+    units, _, predicted, passed = zip(*trials, strict=True)
+    return score.judge(torch.tensor(predicted, dtype=torch.float64), torch.tensor(passed), units)
+
+
+def judge_order(cells: list[Cell]) -> list[Row]:
+    """Return how much more often the best grasp passes than the mean of the 20 best, and how often by group."""
+    gains = [(c.family, 100 * (c.best[0][2] - sum(x[2] for x in c.best) / len(c.best))) for c in cells]
+    gain, rows = mean_over(gains), list[Row]()
+    text = f"{gain.value:+.1f} [{gain.low:.1f}, {gain.high:.1f}] points of {gain.total} plans"
+    rows.append(Row("best one over the mean of 20 best", ">= +6 points", text, gain.value >= 6 and gain.low > 0, {}))
+    bars = {"solid": (95, 99), "shell": (90, 97), "thin": (80, 90)}
+    for name, (one, two) in bars.items():
+        mine = [cell for cell in cells if cell.group == name]
+        first = share_of(mine, lambda cell: cell.best[0][2])
+        both = share_of(mine, lambda cell: any(x[2] for x in cell.best[:2]))
+        rows += [bar_row(f"best one, {name}", one, first), bar_row(f"within two tries, {name}", two, both)]
     return rows
 
 
-def read_trials(objects: Path, hands: Sequence[str], grasps: int, workers: int | None, folder: Path) -> Trials:
-    """Return trials on the objects of a folder, running what is missing; nothing is run without workers (None).
-
-    Raises:
-        FileNotFoundError: the trials of an object came to no end.
-    """
-    names = sorted({name for name, _ in list_views(objects)})
-    tasks = [(objects, name, hand, grasps, folder) for hand in hands for name in names]
-    missing = [task for task in tasks if not kept_at(*task).exists()]
-    if workers is None:
-        tasks, missing = [task for task in tasks if task not in missing], []
-    running = run_tasks(try_object, missing, workers or 0, LIMIT)
-    for _ in tqdm(running, total=len(missing), disable=None, leave=False):
-        pass
-    rows = [row for task in tasks for row in describe_trials(*task)]
-    return Trials(*(np.array([row[name] for row in rows]) for name in Trials._fields))
-
-
-def kept_at(source: Path, name: str, hand: str, grasps: int, folder: Path) -> Path:
-    """Return where the trials of an object are kept: those of another number of grasps stay apart."""
-    return folder / f"{hand}_{source.name}_{name}_{grasps}.json"
-
-
-def grasps_at(source: Path, name: str, hand: str, folder: Path) -> Path:
-    """Return where the executable grasps of an object are kept."""
-    return folder / "grasps" / hand / source.name / f"{name}.safetensors"
-
-
-def try_object(source: Path, name: str, hand: str, grasps: int, folder: Path) -> None:
-    """Plan on the first view of an object, and keep a row for each trial: grasp, test, and whether it passed."""
-    model, rows, view = load_hand(hand), [], next(view for found, view in list_views(source) if found == name)
-    planned = plan_grasps(read_view(source, name, view), model, ContactSpec(friction=FRICTION, table=0.0), STARTS)
-    executable = planned[planned.status == Status.OK]
-    executable.save(grasps_at(source, name, hand, folder))
-    mesh = read_object_mesh(source, name)
-    parts, first = convex_parts(mesh), seed_of(0, name, hand)
-    for k, rank in enumerate(choose_rows(len(executable), grasps, "spread")):
-        for test in (0, 1 + (first + k) % (len(TESTS) - 1)):
-            protocol = PROTOCOLS[TESTS[test][0]].with_trial(closing=TESTS[test][1])
-            seed, grasp = seed_of(0, name, hand, rank, test), executable[rank]
-            error = draw_error(protocol, grasp, mesh, seed)
-            trial = GraspTrial(model, grasp, Truth(mesh, parts, error), seed_of(seed, "touch"))
-            passed = run_protocol(trial, protocol, rank).held
-            rows.append({"object": name, "view": view, "hand": hand, "test": test, "rank": rank, "passed": passed})
-    write_file(kept_at(source, name, hand, grasps, folder), format_json(rows))
-
-
-def describe_trials(source: Path, name: str, hand: str, grasps: int, folder: Path) -> list[dict[str, Any]]:
-    """Return the kept rows of an object with its family and the features of each grasp at its test's friction."""
-    rows = json.loads(kept_at(source, name, hand, grasps, folder).read_text())
-    if not rows:
-        return []
-    shape = fit_shape(read_view(source, name, rows[0]["view"]), table=0.0)
-    center, family = extract_surface(shape).vertices.mean(0), read_entry(source, name).family or name
-    model, planned = load_hand(hand), load_grasps(grasps_at(source, name, hand, folder))
-    frictions = [PROTOCOLS[TESTS[row["test"]][0]].trial.friction for row in rows]
-    for friction in sorted(set(frictions)):
-        mine = [row for row, own in zip(rows, frictions, strict=True) if own == friction]
-        tried = planned[torch.tensor([row["rank"] for row in mine])]
-        features = success_features(model, shape, tried, center, friction)
-        for row, known in zip(mine, features.tolist(), strict=True):
-            row |= {"features": known, "family": family, "test": ", ".join(TESTS[row["test"]])}
+def judge_promise(cells: list[Cell]) -> list[Row]:
+    """Return how often the best grasp passes where the promise returns it, and how often the promise is refused."""
+    promise = find_promise(SHARE)
+    if promise is None:
+        return [Row(f"promise {SHARE:g}", "a bound", "the trials support none", False, {})]
+    least = float(torch.sigmoid(torch.tensor(promise.least)))
+    kept = [cell for cell in cells if cell.best[0][1] >= least]
+    refused = 100 * (1 - len(kept) / len(cells))
+    rows = [Row(f"promise {SHARE:g}: views refused", "<= 15 %", f"{refused:.1f} %", refused <= 15, {"least": least})]
+    for name, mine in {"all": kept, **group_cells(kept)}.items():
+        found = share_of(mine, lambda cell: cell.best[0][2])
+        rows.append(bar_row(f"promise {SHARE:g}: held of returned, {name}", 100 * SHARE, found))
     return rows
 
 
-def fit(trials: Trials) -> SuccessModel:
-    """Return a logistic regression of the features as they are, with one bias a hand."""
-    hands, count = np.unique(trials.hand), trials.features.shape[1]
-    known = np.column_stack([trials.features, beside_plan(trials), *(trials.hand == hand for hand in hands[1:])])
-    scaler = StandardScaler().fit(known)
-    model = LogisticRegression(C=PENALTY, tol=1e-10, max_iter=1000)
-    model.fit(scaler.transform(known), trials.passed)
-    weights = model.coef_[0] / scaler.scale_
-    bias = float(model.intercept_[0] - weights @ scaler.mean_)
-    more = dict(zip(hands.tolist(), [0.0, *weights[count + 1 :].tolist()], strict=True))
-    biases = {hand: bias + added for hand, added in more.items()}
-    return SuccessModel(weights[:count], biases, float(weights[count]))
+def group_cells(cells: list[Cell]) -> dict[str, list[Cell]]:
+    """Return the plans by group of objects, by friction, by mass and by hand."""
+    keys: tuple[Callable[[Cell], str], ...] = (
+        lambda cell: cell.group, lambda cell: f"friction {cell.friction:g}", lambda cell: f"{cell.mass:g} kg",
+        lambda cell: cell.hand,
+    )  # fmt: skip
+    names = [sorted({key(cell) for cell in cells}) for key in keys]
+    return {n: [c for c in cells if key(c) == n] for key, some in zip(keys, names, strict=True) for n in some}
 
 
-def leave_one_out(trials: Trials) -> np.ndarray:
-    """Return for each trial the prediction of a model fitted on the other families alone."""
-    predicted = np.zeros(len(trials.passed))
-    for name in np.unique(trials.family):
-        mine = trials.family == name
-        predicted[mine] = fit(trials.select(~mine)).predict(trials.select(mine))
-    return predicted
+def share_of(cells: list[Cell], held: Callable[[Cell], bool]) -> Share:
+    """Return the share of plans that held, with its interval over families."""
+    return share_over(count_by((cell.family, held(cell)) for cell in cells))
 
 
-def describe(predicted: np.ndarray, trials: Trials) -> dict[str, Any]:
-    """Return what `torchgrasp.evaluation.score` finds of predictions, with intervals over families."""
-    passed = torch.from_numpy(trials.passed.astype(bool))
-    return score.judge(torch.from_numpy(predicted), passed, trials.family.tolist())
-
-
-def judge(predicted: np.ndarray, trials: Trials) -> list[str]:
-    """Return what is to be said of predictions: of all, each hand and each test; then the bins of all and each hand."""
-    kinds = [("all", np.ones(len(predicted), dtype=bool))]
-    kinds += [(str(name), trials.hand == name) for name in np.unique(trials.hand)]
-    binned = len(kinds)
-    kinds += [(str(name), trials.test == name) for name in np.unique(trials.test)]
-    found, lines = [describe(predicted[mine], trials.select(mine)) for _, mine in kinds], []
-    for (name, mine), said in zip(kinds, found, strict=True):
-        scores = f"Brier {said['brier']:.3f}, skill {said['skill']:.2f}, AUC {said['auc']:.2f}, ECE {said['error']:.3f}"
-        lines.append(
-            f"{name}: {scores}, predicted {said['predicted']:.2f}, passed {said['passed']:.2f} of {mine.sum()}"
-        )
-    for (name, _), said in zip(kinds[:binned], found[:binned], strict=True):
-        for x in said["bins"]:
-            value, least, most, count, _ = x.passed
-            lines.append(
-                f"{name}, {x.low:.1f} to {x.high:.1f}: predicted {x.predicted:.2f}, "
-                f"passed {value:.2f} [{least:.2f}, {most:.2f}] of {count}"
-            )
-    return lines
-
-
-def draw_reliability(path: Path, predicted: np.ndarray, trials: Trials) -> None:
-    """Draw the share that passed over the prediction, with intervals and counts."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.2, 5.0), dpi=140, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(xlabel="predicted success", ylabel="share that passed", xlim=(0, 1), ylim=(0, 1))
-    axes.plot([0, 1], [0, 1], color="#7c8591", linewidth=1)
-    axes.fill_between([0, 1], [-NEAR, 1 - NEAR], [NEAR, 1 + NEAR], color="#e7e5de", zorder=0)
-    for x in describe(predicted, trials)["bins"]:
-        value, low, high, count, _ = x.passed
-        ends = [[0.0], [0.0]] if math.isnan(low) else [[value - low], [high - value]]
-        axes.errorbar([x.predicted], [value], ends, fmt="o", color="#23967f", capsize=3)
-        axes.annotate(f"{count}", (x.predicted, value), (6, -12), textcoords="offset points", color="#4b525b")
-    axes.set_title(f"{len(predicted)} trials on objects not fitted on")
-    write_file(path, lambda file: figure.savefig(file, format="png"))
+def bar_row(what: str, bar: float, found: Share) -> Row:
+    """Return a row for a share of plans."""
+    return Row(what, f">= {bar:g} %", format_share(found), 100 * found.value >= bar if found.total else None, {})

@@ -1,0 +1,98 @@
+"""Trials with the features of their grasps, from which the model of success is fitted."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy import ndarray as Array
+from tqdm import tqdm
+
+from torchgrasp.data.reader import read_shards
+from torchgrasp.data.shards import JobRow
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
+from torchgrasp.jobs import run_tasks
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.surface import extract_mesh
+from torchgrasp.success.features import FEATURES, measure_grasps
+from torchgrasp.success.model import SuccessModel
+from torchgrasp.values import Grasps, PointCloud
+from train.trials import BEST, SPREAD, Trial, read_rows
+
+FILE = "features.npz"
+"""Name of the file in a data set that keeps the features of its trials."""
+
+LIMIT = 7200.0
+"""Wall time [s] in which the grasps of one data set are measured."""
+
+
+class Trials(NamedTuple):
+    """Trials: `features` (n, k), whether each `passed`, its family and rank, and whether it was the best of its body.
+
+    `best` tells whether no other grasp that was tried on the body has a greater prediction for the task of the trial;
+    `beside` (n, m, k) holds the features of all these grasps for this task, with NaN where there are fewer than m, and
+    `place` says which of them was tried.
+    """
+
+    features: Array
+    passed: Array
+    family: Array
+    rank: Array
+    hand: Array
+    beside: Array
+    place: Array
+
+    def select(self, rows: Array) -> "Trials":
+        """Return some of the trials, by a mask."""
+        return Trials(*(column[rows] for column in self))
+
+    def is_best(self, model: SuccessModel) -> Array:
+        """Return a mask of the trials whose grasp has the greatest prediction of those that were tried on its body."""
+        odds = model.log_odds(torch.from_numpy(self.beside.reshape(-1, len(FEATURES)))).numpy()
+        odds = np.where(np.isnan(self.beside[..., 0]), -np.inf, odds.reshape(self.beside.shape[:2]))
+        return odds.argmax(1) == self.place
+
+
+def read_trials(folders: Sequence[Path], workers: int = 1) -> Trials:
+    """Return the trials of data sets of `train.trials`, one for each hand; features of an earlier call are read."""
+    missing = [(folder,) for folder in folders if not (folder / FILE).exists()]
+    for _ in tqdm(run_tasks(measure_folder, missing, workers, LIMIT), total=len(missing), disable=None):
+        pass
+    parts = [np.load(folder / FILE) for folder in folders]
+    return Trials(*(np.concatenate([part[name] for part in parts]) for name in Trials._fields))
+
+
+def measure_folder(folder: Path) -> None:
+    """Measure the grasps of a data set for the tasks of its trials, and keep the result in its folder."""
+    data = read_shards(folder)
+    asked = data.card["asked"]["hand"]
+    found = measure_jobs(load_hand(asked["name"], asked["option"]), read_rows(data))
+    np.savez_compressed(folder / FILE, **found._asdict())
+
+
+def measure_jobs(hand: Hand, jobs: Iterable[tuple[JobRow, PointCloud, Grasps, list[Trial]]]) -> Trials:
+    """Return the trials of jobs of one hand with their features."""
+    columns = [measure_job(hand, cloud, grasps, trials) for _, cloud, grasps, trials in jobs]
+    return Trials(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+
+def measure_job(hand: Hand, cloud: PointCloud, grasps: Grasps, trials: list[Trial]) -> Trials:
+    """Return the trials of one view of a body with their features."""
+    shape = fit_shape(cloud, table=0.0)
+    vertices, n = extract_mesh(shape).vertices, len(trials)
+    beside = np.full((n, BEST + SPREAD, len(FEATURES)), np.nan)
+    for k, trial in enumerate(trials):
+        task, friction, lifted = trial.task.known, trial.task.friction, trial.task.lift
+        beside[k, :n] = measure_grasps(hand, shape, vertices, grasps, friction, task, lifted).numpy()
+    place = np.arange(n)
+    return Trials(
+        features=beside[place, place],
+        passed=np.array([trial.passed for trial in trials]),
+        family=np.array([trial.family for trial in trials]),
+        rank=np.array([trial.rank for trial in trials]),
+        hand=np.array([hand.name] * n),
+        beside=beside,
+        place=place,
+    )
