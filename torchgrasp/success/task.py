@@ -47,6 +47,7 @@ class GraspTask(Value):
         force = "" if self.force is None else f" with {self.force:g} N"
         return f"{what} of {self.mass:g} kg{force}" + (", displaced" if self.displaced else "")
 
+    @checked
     def pressing(self, lifted: bool) -> float:
         """Return the normal force [N] of the strongest finger; 0 where the hand grips as the felt load asks for."""
         return self.force or (0.0 if lifted else 4.0)
