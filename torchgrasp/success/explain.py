@@ -20,7 +20,7 @@ from torchgrasp.values import Grasps
 SENTENCES = {
     "load": "the load takes {force needed at half friction} of a finger, and its centre is {offset} from the contacts",
     "friction": "friction has {angle to spare} to spare beyond the balance of the fingers' forces",
-    "surface": "the surface may be {deviation} off at a contact, and its normal {tilt}",
+    "surface": "the surface may be {deviation} off at a contact",
     "unseen": "a contact is {from seen} from the points that the camera saw",
     "bend": "the surface bends by {bend} around a contact",
     "place": "the lowest contact is {height of lowest} above the foot, and the contacts are {span} apart",
