@@ -89,7 +89,7 @@ def draw_task(draw: np.random.Generator, planned: float) -> Task:
     >>> draw_task(np.random.default_rng(0), 0.6) == draw_task(np.random.default_rng(0), 0.6)
     True
     """
-    lift, kept, errs, grips = draw.random(4) < (0.5, 0.5, 0.5, 0.75)
+    lift, kept, errs, grips = draw.random(4) < (0.25, 0.5, 0.5, 0.75)  # a lift takes three times as long as pulls
     friction, force = (round(float(draw.uniform(*bounds)), 3) for bounds in (FRICTION, FORCE))
     mass = round(math.exp(draw.uniform(*np.log(MASS))), 4)
     closing = "uncertainty" if lift or draw.random() < 0.5 else "open_loop"
