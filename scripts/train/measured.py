@@ -29,11 +29,10 @@ LIMIT = 7200.0
 
 
 class Trials(NamedTuple):
-    """Trials: `features` (n, k), whether each `passed`, its family and rank, and whether it was the best of its body.
+    """Trials: `features` (n, k), whether each `passed`, its family, rank and hand.
 
-    `best` tells whether no other grasp that was tried on the body has a greater prediction for the task of the trial;
-    `beside` (n, m, k) holds the features of all these grasps for this task, with NaN where there are fewer than m, and
-    `place` says which of them was tried.
+    `beside` (n, m, k) holds the features of all grasps that were tried on the body, for the task of the trial, with NaN
+    where there are fewer than m. `place` says which of them the trial tried.
     """
 
     features: Array

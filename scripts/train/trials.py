@@ -66,8 +66,8 @@ license: mit
 # Grasps of the {hand} hand on household bodies, each tried with a task of its own
 
 {counts[tries]} trials of {counts[objects]} bodies of {counts[families]} families; {counts[passed]} passed.
-`scripts/train.py trials` makes them. A job is one noisy view of one body, planned on from {starts} starts. {best} of
-its twenty best grasps and {more} others are tried in MuJoCo. `read_rows` of `train/trials.py` reads jobs with their
+`scripts/train.py trials` makes them. A job is one noisy view of one body, planned on from {starts} starts. Tried
+in MuJoCo are {which}. `read_rows` of `train/trials.py` reads jobs with their
 tasks: friction, mass, force, protocol, and whether the object is elsewhere.
 
 Made with {versions}.
@@ -136,9 +136,9 @@ def run_trials(
     with tqdm(total=len(rows), disable=None) as bar:
         data = carry_out(campaign, folder / hand, work, lambda _: bar.update())
     counts = data.card["counts"]
-    about = ABOUT.format(
-        hand=hand, counts=counts, versions=json.dumps(versions()), starts=STARTS, best=BEST, more=SPREAD
-    )
+    spread = f"{BEST} of its twenty best grasps and {SPREAD} others"
+    which = f"the best grasps for {TASKS} ordinary tasks" if best else spread
+    about = ABOUT.format(hand=hand, counts=counts, versions=json.dumps(versions()), starts=STARTS, which=which)
     write_file(folder / hand / README, about)
     return data
 
@@ -174,7 +174,7 @@ def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: J
     shape = fit_shape(cloud, table=table)
     if best:
         tasks = [draw_ordinary(draw, friction) for _ in range(TASKS)]
-        ranks = [best_for(task, hand, shape, executable) for task in tasks]
+        ranks = best_for(tasks, hand, shape, executable)
     else:
         ranks = choose_ranks(len(executable), draw)
         tasks = [draw_task(draw, friction) for _ in ranks]
@@ -193,11 +193,13 @@ def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: J
     return Shard((row,), Records(cloud.points.double(), eye, executable[ranks], passed, outcome))
 
 
-def best_for(task: Task, hand: Hand, shape: ShapeGP, grasps: Grasps) -> int:
-    """Return the index of the grasp that most likely holds a task."""
-    vertices = extract_mesh(shape).vertices
-    features = measure_grasps(hand, shape, vertices, grasps, task.friction, task.known, task.lift)
-    return int(load_model().log_odds(features).where(is_known(features), -torch.inf).argmax())
+def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) -> list[int]:
+    """Return for each task the index of the grasp that most likely holds it."""
+    vertices, best = extract_mesh(shape).vertices, list[int]()
+    for task in tasks:
+        features = measure_grasps(hand, shape, vertices, grasps, task.friction, task.known, task.lift)
+        best.append(int(load_model().log_odds(features).where(is_known(features), -torch.inf).argmax()))
+    return best
 
 
 def choose_ranks(executable: int, draw: np.random.Generator) -> list[int]:

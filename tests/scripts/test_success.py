@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 pytest.importorskip("sklearn")
+from benchmarks.close import success as bench
 from benchmarks.close.success import Cell, judge_order, judge_predictions, judge_promise, judge_trials
 from train.measured import Trials
 from train.success import find_bands, fit_model, judge, keep_trials
 
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import load_model
-from torchgrasp.success.promise import find_promise
+from torchgrasp.success.promise import Promise
 
 
 def draw_trials(count: int = 6000, families: int = 30, seed: int = 0) -> tuple[Trials, np.ndarray]:
@@ -75,7 +76,7 @@ def cell(family: str, group: str, outcomes: list[bool], predicted: list[float]) 
     return Cell(family, family, group, "allegro", 0.6, 0.1, 30, tried)
 
 
-def test_the_bench_counts_the_best_grasp_two_tries_and_the_promise():
+def test_the_bench_counts_the_best_grasp_two_tries_and_the_promise(monkeypatch):
     high = [0.99, 0.98, 0.5, 0.4]
     first, second = [True, False, True, False], [False, True, False, False]
     cells = [cell(f"s{k}", "solid", first, high) for k in range(3)] + [cell("t", "thin", second, high)]
@@ -83,9 +84,13 @@ def test_the_bench_counts_the_best_grasp_two_tries_and_the_promise():
     assert rows["best one over the mean of 20 best"].measured.startswith("+31.2")  # 3 of +50, 1 of -25
     assert rows["best one, solid"].met and not rows["best one, thin"].met and rows["within two tries, thin"].met
     assert rows["best one, shell"].met is None
-    promised = judge_promise(cells)
-    if find_promise(0.9) is not None:
-        assert any("refused" in row.what for row in promised)
+    cells += [cell("t", "thin", second, [0.6, 0.5, 0.4, 0.3])]
+    monkeypatch.setattr(bench, "find_promise", lambda share: Promise(2.0, 100, 30))  # 0.88
+    promised = {row.what.removeprefix("promise 0.9: "): row for row in judge_promise(cells)}
+    assert promised["views refused"].measured == "20.0 %" and not promised["views refused"].met
+    assert promised["held of returned, all"].measured.startswith("75.0 %") and promised["held of returned, solid"].met
+    monkeypatch.setattr(bench, "find_promise", lambda share: None)
+    assert [row.met for row in judge_promise(cells)] == [False]
     trials = [(f"f{k % 7}", 0, p, (k % 10) < 10 * p) for k in range(200) for p in (0.2, 0.8)]
     said = judge_trials(trials)
     assert said["error"] < 0.01 and said["auc"] == pytest.approx(0.8)

@@ -53,9 +53,7 @@ def least_log_odds(
         return None
     number = family.unique(return_inverse=True)[1]
     count, risk = torch.bincount(number).to(log_odds), (~held).to(log_odds) - (1 - share)
-    for bound in torch.linspace(float(log_odds.min()), float(log_odds.max()), 200, dtype=log_odds.dtype).tolist():
-        loss = torch.where(log_odds >= bound, risk, 0.0)
-        mean = torch.zeros_like(count).index_add(0, number, loss) / count
-        if float(mean.sum()) + share <= 0:
-            return bound
-    return None
+    bounds = torch.linspace(float(log_odds.min()), float(log_odds.max()), 200, dtype=log_odds.dtype)
+    weighted = risk / count[number]  # its sum is that of the means of all families
+    kept = torch.where(log_odds >= bounds[:, None], weighted, 0.0).sum(1) + share <= 0
+    return float(bounds[kept][0]) if bool(kept.any()) else None

@@ -34,7 +34,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, TrialSpec
 from torchgrasp.success import GraspTask, explain_success
-from torchgrasp.values import PointCloud, format_success
+from torchgrasp.values import Grasps, PointCloud, format_success
 
 if TYPE_CHECKING:
     import trimesh
@@ -64,9 +64,7 @@ class Grasp(Command):
     close: bool = option(False, 'close the best grasp on the mesh, lift it and hold it (needs the extra "sim")')
     seed: Seed = option(0, "random seed; the same seed gives the same grasps")
     starts: Count = option(1000, inputs.STARTS_HELP)
-    time_budget: float | None = option(
-        None, "seconds for planning; the batch that ends after them is the last. By default there is no limit"
-    )
+    time_budget: float | None = option(None, "seconds after which no batch of planning begins; by default no limit")
     view: inputs.CloudOptions = nested(inputs.CloudOptions())
     friction: float = option(0.8, "coefficient of friction between fingertips and object")
     mass: float = option(0.25, "mass [kg] for which success is predicted, and with which the simulator lifts")
@@ -136,8 +134,10 @@ class Grasp(Command):
             hand, name = hand_of(grasps, hand), inputs.object_name(path if mesh is None else mesh)
             surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
             stages = tuple(progress.stages)
-            run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, explanation=explanation)
-            run = dataclasses.replace(run, costs=self._costs(run, progress.values["shape"]))
+            costs = self._costs(grasps, hand, progress.values["shape"])
+            run = Run(
+                name, path, cloud, hand, spec, surface, grasps, stages, plan, explanation=explanation, costs=costs
+            )
             if self.close and true_mesh is not None and len(run.executable):
                 felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
                 trial = TrialSpec(friction=self.friction, mass=self.mass)
@@ -149,12 +149,10 @@ class Grasp(Command):
         executable = print_grasps(run)
         return 0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
 
-    def _costs(self, run: Run, shape: ShapeGP) -> tuple[str, ...]:
-        """Return what lowers the predicted success of the best grasp most, in sentences."""
-        best = run.executable[:1]
-        return tuple(
-            x.sentence for grasp in best for x in explain_success(grasp, run.hand, shape, GraspTask(self.mass))
-        )
+    def _costs(self, grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[str, ...]:
+        """Return what lowers the predicted success of the best executable grasp most, in sentences."""
+        best = grasps[grasps.status == Status.OK][:1]
+        return tuple(x.sentence for grasp in best for x in explain_success(grasp, hand, shape, GraspTask(self.mass)))
 
     def _task(self) -> dict[str, Any]:
         """Return the options of the planner that say what the grasps must do."""
@@ -200,8 +198,8 @@ class Grasp(Command):
             spec, hand = dataclasses.replace(spec, table=scene.table), hand_of(grasps, hand)
             cloud, name, surface = take_target(scene, self.seed), f"object {scene.target}", extract_surface(shape)
             stages, plan = tuple(progress.stages), progress.values.get("plan")
-            run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, None, None, scene, explanation)
-            run = dataclasses.replace(run, costs=self._costs(run, shape))
+            told = explanation, self._costs(grasps, hand, shape)
+            run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, None, None, scene, *told)
             progress.end("report", write_results(out, run, self.no_report))
         return 0 if print_grasps(run) else 1
 
