@@ -15,9 +15,9 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_tasks
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.surface import extract_mesh
 from torchgrasp.success.features import FEATURES, measure_grasps
 from torchgrasp.success.model import SuccessModel
+from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.values import Grasps, PointCloud
 from train.trials import BEST, SPREAD, Trial, read_rows
 
@@ -79,12 +79,11 @@ def measure_jobs(hand: Hand, jobs: Iterable[tuple[JobRow, PointCloud, Grasps, li
 
 def measure_job(hand: Hand, cloud: PointCloud, grasps: Grasps, trials: list[Trial]) -> Trials:
     """Return the trials of one view of a body with their features."""
-    shape = fit_shape(cloud, table=0.0)
-    vertices, n = extract_mesh(shape).vertices, len(trials)
+    body, n = EstimatedBody.of(fit_shape(cloud, table=0.0)), len(trials)
     beside = np.full((n, BEST + SPREAD, len(FEATURES)), np.nan)
     for k, trial in enumerate(trials):
         task, friction, lifted = trial.task.known, trial.task.friction, trial.task.lift
-        beside[k, :n] = measure_grasps(hand, shape, vertices, grasps, friction, task, lifted).numpy()
+        beside[k, :n] = measure_grasps(hand, body, grasps, friction, task, lifted).numpy()
     place = np.arange(n)
     return Trials(
         features=beside[place, place],

@@ -35,10 +35,11 @@ from torchgrasp.jobs import run_as_they_end
 from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.surface import extract_mesh, surface_field
+from torchgrasp.shape.surface import surface_field
 from torchgrasp.specs import ContactSpec
 from torchgrasp.success.features import measure_grasps
 from torchgrasp.success.model import MODEL, load_model
+from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.success.order import is_known
 from torchgrasp.values import Grasps, PointCloud
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
@@ -195,9 +196,9 @@ def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: J
 
 def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) -> list[int]:
     """Return for each task the index of the grasp that most likely holds it."""
-    vertices, best = extract_mesh(shape).vertices, list[int]()
+    body, best = EstimatedBody.of(shape), list[int]()
     for task in tasks:
-        features = measure_grasps(hand, shape, vertices, grasps, task.friction, task.known, task.lift)
+        features = measure_grasps(hand, body, grasps, task.friction, task.known, task.lift)
         best.append(int(load_model().log_odds(features).where(is_known(features), -torch.inf).argmax()))
     return best
 

@@ -15,11 +15,12 @@ factors c_i = 2 / (preferred normal force) also fix the scale.
 
 import functools
 import math
+from collections.abc import Iterable
 from typing import Annotated
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.checks import ANY, Positive, checked
@@ -117,13 +118,35 @@ def _search_forces(
     push = -(basis * normals[:, None]).sum(-1)
     slide = (basis + push[..., None] * normals[:, None]).reshape(-1, 3, 9).swapaxes(1, 2)
     push = push.swapaxes(1, 2)  # (b, 3, 3): normal force at each contact by each push
-    row = torch.arange(len(points), device=points.device)
-    weights = torch.zeros_like(push[:, 0])
+    weights, found = _improve(push, slide, torch.zeros_like(push[:, 0]), _search_steps(), preferred)
+    forces = (weights[:, None] @ basis.reshape(-1, 3, 9)).reshape(-1, 3, 3)
+    return torch.where(found[:, None, None], forces, torch.nan)
+
+
+def forces_near(points: Vectors, normals: Vectors, weights: Float[Tensor, "b p"]) -> Vectors:
+    """Return balanced forces of little friction whose shares on the `internal_forces` are near given `weights`.
+
+    A short search begins with the weights. Forces are of any scale; a row is NaN where none is found that pushes at all
+    contacts.
+    """
+    pairs = internal_forces(points)
+    push = -(pairs * normals[:, None]).sum(-1)
+    slide = (pairs + push[..., None] * normals[:, None]).flatten(2)
+    weights, found = _improve(push.mT, slide.mT, weights, _near_steps(weights.shape[1]), None)
+    return torch.where(found[:, None, None], torch.einsum("bp,bpfi->bfi", weights, pairs), torch.nan)
+
+
+def _improve(
+    push: Float[Tensor, "b f p"], slide: Float[Tensor, "b n p"], weights: Float[Tensor, "b p"],
+    rounds: Iterable[Float[Tensor, "p s"]], preferred: Float[Tensor, "b f"] | None,
+) -> tuple[Float[Tensor, "b p"], Bool[Tensor, "b"]]:  # fmt: skip
+    """Return the weights of least cost in rounds of tried steps, of length 1, and whether they push everywhere."""
+    row = torch.arange(len(push), device=push.device)
     best, costs = row, weights
-    for steps in _search_steps():
+    for steps in rounds:
         tried = weights[:, :, None] + steps.to(push.device)
         normal, across = push @ tried, slide @ tried
-        ratio = ((across * across).unflatten(1, (3, 3)).sum(2) / (normal * normal)).amax(1) ** 0.5
+        ratio = ((across * across).unflatten(1, (-1, 3)).sum(2) / (normal * normal)).amax(1) ** 0.5
         least, most = normal.amin(1), normal.amax(1)
         if preferred is None:
             uneven = EVENNESS * most / least
@@ -134,8 +157,7 @@ def _search_forces(
         best = costs.argmin(-1)
         weights = tried[row, :, best]
         weights = weights / (weights * weights).sum(-1)[:, None] ** 0.5
-    forces = (weights[:, None] @ basis.reshape(-1, 3, 9)).reshape(-1, 3, 3)
-    return torch.where(torch.isfinite(costs[row, best])[:, None, None], forces, torch.nan)
+    return weights, torch.isfinite(costs[row, best])
 
 
 @functools.cache
@@ -146,6 +168,17 @@ def _search_steps() -> tuple[Float[Tensor, "3 s"], ...]:
         around = torch.cat([near.new_zeros(1, 3), near]).T
     radii = 4 / math.sqrt(DIRECTIONS) * SHRINK ** np.arange(REFINEMENTS)
     return first.T.contiguous(), *(radius * around for radius in radii.tolist())
+
+
+@functools.cache
+def _near_steps(pairs: int) -> tuple[Float[Tensor, "p s"], ...]:
+    """Return for each round of a short search the changes of the weights of all pairs that it tries."""
+    count, radii = 24, (0.5, 0.28, 0.15)
+    draw = torch.Generator("cpu").manual_seed(0)
+    steps = unit(torch.randn(count, pairs, generator=draw, dtype=torch.float64, device="cpu"))
+    steps = steps * torch.linspace(0.3, 1.0, count, dtype=torch.float64, device="cpu")[:, None]
+    around = torch.cat([steps.new_zeros(1, pairs), steps]).T
+    return tuple(radius * around for radius in radii)
 
 
 def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "b f"], slack: float) -> Vectors:

@@ -179,8 +179,8 @@ def rank(problem: Problem, solved: Grasps) -> Grasps:
         buried = torch.where(solved.status == Status.OK, int(Status.BURIED), solved.status)
         solved = dataclasses.replace(solved, status=buried)
     good = solved[solved.status == Status.OK]
-    task, shape, vertices = request.grasp_task, problem.shape, problem.surface.vertices
-    features = measure_grasps(hand, shape, vertices, good, spec.friction, task, task.lifts(spec.plane))
+    task = request.grasp_task
+    features = measure_grasps(hand, problem.body, good, spec.friction, task, task.lifts(spec.plane))
     log_odds = load_model(features.device).log_odds(features)
     if problem.obstacles is not None:
         free = 1 - collision_probability(hand, good, problem.obstacles, spec.plane).to(log_odds)

@@ -17,13 +17,11 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.files import sha256
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, round_upright, upright_frame
-from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import GraspProblem, Reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
 from torchgrasp.ik.seeds import PostureLibrary
-from torchgrasp.plan.problem import walls_of
 from torchgrasp.plan.starts import Settled, settle_flatness
 from torchgrasp.planner.request import Observer, Request, ignore
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
@@ -32,8 +30,9 @@ from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.shape.fit import FitOptions, fit_upright
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.surface import Mesh, extract_mesh
+from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
 from torchgrasp.specs import ContactSpec
+from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.success.promise import describe_promise
 from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud
 
@@ -114,6 +113,11 @@ class Problem:
         """The estimated surface, as a mesh."""
         return extract_mesh(self.shape)
 
+    @cached_property
+    def body(self) -> EstimatedBody:
+        """The estimated body, with its distance field."""
+        return EstimatedBody(self.shape, self.surface.vertices, collision_field(self.shape, self.surface))
+
     @property
     def center(self) -> Float[Tensor, "3"]:
         """The centre [m] of the estimated surface: the mean of its vertices."""
@@ -137,10 +141,7 @@ class Problem:
     @cached_property
     def world(self) -> CollisionWorld:
         """The object, table and obstacles that the hand's links must not touch, as distance fields."""
-        vertices, faces = self.surface.vertices, self.surface.faces
-        thick = float((vertices.amax(0) - vertices.amin(0)).min()) > 0.04 and len(walls_of(self.shape)) == 1
-        field = field_from_surface(vertices, faces, spacing=0.004 if thick else 0.003)
-        return CollisionWorld(field, self.spec.plane, self.obstacles)
+        return CollisionWorld(self.body.field, self.spec.plane, self.obstacles)
 
     @cached_property
     def library(self) -> PostureLibrary:

@@ -11,22 +11,17 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.surface import extract_mesh
 from torchgrasp.success.features import CAUSES, measure_grasps
 from torchgrasp.success.model import load_model
+from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values import Grasps
 
 SENTENCES = {
-    "load": "the load takes {force needed at half friction} of a finger, and its centre is {offset} from the contacts",
-    "friction": "friction has {angle to spare} to spare beyond the balance of the fingers' forces",
+    "load": "at half the friction the load takes {force needed} of a finger; its centre is {offset} from the contacts",
+    "moved": "the fingers carry the load in a share of {carried if moved} of the places within 20 mm of the object",
     "surface": "the surface may be {deviation} off at a contact",
-    "unseen": "a contact is {from seen} from the points that the camera saw",
-    "bend": "the surface bends by {bend} around a contact",
-    "place": "the lowest contact is {height of lowest} above the foot, and the contacts are {span} apart",
-    "posture": "a finger has a lever of {lever}, and its pad meets the surface at {pad angle}",
     "object": "the object is {height} high and {size} in radius",
-    "hand": "the hand has fingertips of {tip radius} in radius",
     "task": "the task is {mass} at a friction of {friction}",
 }
 """What is said of each cause; the names of features stand for their values."""
@@ -82,7 +77,7 @@ def measure_again(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask) -
     frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
     upright, shape = move(grasps, frame), shape.moved(frame)
     hand, friction = hand.to(grasps.joints.device, grasps.joints.dtype), float(grasps.meta["friction"])
-    return measure_grasps(hand, shape, extract_mesh(shape).vertices, upright, friction, task, task.lifts(grasps.table))
+    return measure_grasps(hand, EstimatedBody.of(shape), upright, friction, task, task.lifts(grasps.table))
 
 
 def _units() -> list[tuple[str, str]]:

@@ -58,18 +58,6 @@ def carrying_force(
     return torch.where(having > 0, lacking.clamp_min(0) / having, torch.inf).amax((1, 2))
 
 
-def finger_levers(hand: Hand, grasps: Grasps) -> Float[Tensor, "g f"]:
-    """Return each finger's lever [m]: the norm of its joints' moment arms for a force along the contact's normal.
-
-    If the surface is displaced by e, the force of a finger whose joints have stiffness k changes by k e / lever^2.
-    """
-    joints = grasps.joints
-    hand_from_obj, coupling = inverse(grasps.obj_from_hand.to(joints)), hand.actuated.coupling.to(joints)
-    points, normals = apply(hand_from_obj, grasps.contacts.points.to(joints)), grasps.contacts.normals.to(joints)
-    arms = torch.einsum("gfih,gfi->gfh", hand.jacobian(joints, points), rotate(hand_from_obj, normals))
-    return torch.linalg.vector_norm(arms / torch.linalg.vector_norm(coupling, dim=0), dim=-1)
-
-
 def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Float[Tensor, "g"]:
     """Return the factor on balanced contact forces at which the first drive gives its greatest torque; NaN for NaN."""
     joints = grasps.joints

@@ -1,0 +1,90 @@
+"""The contacts of a grasp whose object is not quite where the camera saw it."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.linalg import fibonacci_sphere
+from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.hand.hand import Hand
+from torchgrasp.plan.forces import forces_near, internal_forces
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import collision_field, extract_mesh
+from torchgrasp.values import Contacts, Grasps
+
+Sets = Float[Tensor, "d g f 3"]
+
+
+class EstimatedBody(NamedTuple):
+    """What the planner knows of an object, in an upright frame, whose z axis points up.
+
+    Args:
+        shape: the posterior.
+        vertices: of the estimated surface [m]; their mean is taken for the centre of mass.
+        field: signed distances from the estimated surface.
+    """
+
+    shape: ShapeGP
+    vertices: Float[Tensor, "v 3"]
+    field: SignedDistanceField
+
+    @classmethod
+    def of(cls, shape: ShapeGP) -> "EstimatedBody":
+        """Return the body of a shape in an upright frame."""
+        mesh = extract_mesh(shape)
+        return cls(shape, mesh.vertices, collision_field(shape, mesh))
+
+
+class Touches(NamedTuple):
+    """Contact sets of g grasps after each of d displacements, one after another, with balanced `forces` of any scale.
+
+    `touched` tells whether all fingers touch the object, and can press it.
+    """
+
+    contacts: Contacts
+    forces: Float[Tensor, "dg f 3"]
+    touched: Bool[Tensor, "d g"]
+
+
+def touch_moved(hand: Hand, field: SignedDistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Touches:
+    """Return where the fingers touch the object if the object is displaced, by distances that a hand still finds.
+
+    The displacements fill a ball of 20 mm, in the axes of the hand. Each fingertip moves on along the line from its
+    pre-grasp to its planned pose until it touches the surface, given by `field`. Balanced `forces` at the planned
+    contacts tell how the fingers share their pushes.
+    """
+    count, radius = 16, 0.02  # displacements; the greatest [m]
+    sizes = (torch.arange(count, dtype=torch.float64) * 0.618 % 1.0) ** (1 / 3)  # even in the ball
+    moved = radius * (sizes[:, None] * fibonacci_sphere(count)).to(forces)
+    pose = grasps.obj_from_hand.to(forces)
+    before, after = (apply(pose, hand.tip_centres(q).to(forces)) for q in (grasps.pregrasp, grasps.joints))
+    way = (after - before) / torch.linalg.vector_norm(after - before, dim=-1, keepdim=True).clamp_min(1e-6)
+    start = before - rotate(pose, moved[None]).transpose(0, 1)[:, :, None]
+    points, normals, found = trace(field, start, way.expand_as(start), hand.tips.radius.to(forces))
+    pairs = internal_forces(grasps.contacts.points.to(forces)).flatten(2).mT
+    weights = (torch.linalg.pinv(pairs) @ forces.nan_to_num(0.0).flatten(1)[..., None])[..., 0]
+    points, normals = points.flatten(0, 1), normals.flatten(0, 1)
+    pressed = forces_near(points, normals, weights.repeat(count, 1))
+    push = -(pressed * normals).sum(-1).amax(-1)
+    touched = found.all(-1) & torch.isfinite(push).view(found.shape[:2])
+    return Touches(Contacts(points, normals), pressed / push[:, None, None], touched)
+
+
+def trace(
+    field: SignedDistanceField, start: Sets, way: Sets, radius: Float[Tensor, "f"]
+) -> tuple[Sets, Sets, Bool[Tensor, "d g f"]]:
+    """Return where balls that move from `start` [m] along a `way` first touch a surface, its normals, and whether.
+
+    This is sphere tracing: a ball moves on by its distance from the surface, up to 120 mm in all.
+    """
+    close, least, length = 3e-4, 2e-4, 0.12  # [m]: distance of a touch; least step; longest way
+    travelled = torch.zeros_like(start[..., 0])
+    for _ in range(24):
+        gap = field.query(start + travelled[..., None] * way)[0] - radius
+        travelled = torch.where(gap < close, travelled, travelled + gap.clamp_min(least)).clamp_max(length)
+    distance, gradient = field.query(start + travelled[..., None] * way)
+    normals = gradient / torch.linalg.vector_norm(gradient, dim=-1, keepdim=True).clamp_min(1e-9)
+    return start + travelled[..., None] * way - distance[..., None] * normals, normals, distance - radius < close
