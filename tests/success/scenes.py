@@ -9,8 +9,10 @@ from torchgrasp import fit_shape
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.shape.surface import collision_field, extract_mesh
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import SuccessModel
+from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.values import Certificate, Contacts, Grasps
 
 RADIUS = 0.04
@@ -20,6 +22,12 @@ RADIUS = 0.04
 def whole_ball():
     """The posterior of a ball that was seen from all sides."""
     return fit_shape(ball(600, RADIUS))
+
+
+def ball_body(vertices, shape=None):
+    """The ball as an estimated body, with other vertices."""
+    shape = whole_ball() if shape is None else shape
+    return EstimatedBody(shape, vertices, collision_field(shape, extract_mesh(shape)))
 
 
 UNEVEN = (0.3, 2.4, 4.6, 5.4, 1.3)

@@ -83,7 +83,7 @@ def test_a_cause_that_does_not_lower_the_success_is_not_told(use):
 
 
 def test_a_heavier_object_makes_the_load_or_the_task_a_cause(use):
-    for name, cause in (("mass", "task"), ("force needed at half friction", "load")):
+    for name, cause in (("mass", "task"), ("force needed", "load")):
         light, heavy = (measure_again(*jug(), GraspTask(mass=mass))[0, FEATURES.index(name)] for mass in (0.05, 2.0))
         assert light < heavy
         use(stump(name, float(light + heavy) / 2, 1.0, -1.0))

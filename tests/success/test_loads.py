@@ -1,4 +1,4 @@
-"""How a grasp carries a load: its arm, the force that carries it, the fingers' levers, and their greatest force."""
+"""How a grasp carries a load: its arm, the force that carries it, and the greatest force of the fingers."""
 
 import dataclasses
 import itertools
@@ -14,7 +14,7 @@ from tests.success.scenes import around, grasps_at
 from torchgrasp.geometry.frames import apply, inverse, rotate, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
-from torchgrasp.success.loads import carrying_force, finger_levers, greatest_force, load_arm, log_odds_about
+from torchgrasp.success.loads import carrying_force, greatest_force, load_arm, log_odds_about
 from torchgrasp.values import Contacts
 
 
@@ -78,17 +78,6 @@ def moved_by_joints(hand, grasp, step=1e-6):
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_equal_springs_in_all_joints_yield_by_the_square_of_the_lever(name):
-    hand, grasp = pinch(name)
-    normals = rotate(inverse(grasp.obj_from_hand), grasp.contacts.normals)[0]
-    moves = torch.einsum("fih,fi->fh", moved_by_joints(hand, grasp), normals)
-    stiffness = hand.actuated.coupling.T @ hand.actuated.coupling  # of unit springs in every joint of the URDF
-    for move, lever in zip(moves, finger_levers(hand, grasp)[0], strict=True):
-        yielding = torch.linalg.solve(stiffness, move)  # least energy: stiffness @ yielding = torque of a unit force
-        assert float(move @ yielding) == pytest.approx(float(lever) ** 2, rel=1e-6)
-
-
-@pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_at_the_greatest_force_virtual_work_asks_one_drive_for_its_whole_torque_and_no_drive_for_more(name, generator):
     hand, grasp = pinch(name)
     forces = torch.randn(1, 3, 3, generator=generator, dtype=torch.float64)
@@ -101,20 +90,17 @@ def test_at_the_greatest_force_virtual_work_asks_one_drive_for_its_whole_torque_
 
 
 @pytest.mark.parametrize(("name", "fingers"), [("allegro", 3), ("allegro", 4), ("shadow", 5)])
-def test_levers_and_greatest_forces_of_any_number_of_fingers_do_not_depend_on_other_rows_or_the_dtype(name, fingers):
+def test_greatest_forces_of_any_number_of_fingers_do_not_depend_on_other_rows_or_the_dtype(name, fingers):
     hand = load_hand(name, fingers)
     joints = torch.lerp(hand.lower, hand.upper, torch.linspace(0.2, 0.6, 5, dtype=torch.float64)[:, None])
     _, rows = grasps_at(touched_contacts(hand, joints), name)
     rows = dataclasses.replace(rows, joints=joints)
     forces, small = -rows.contacts.normals, hand.to(torch.float32)
-    levers, greatest = finger_levers(hand, rows), greatest_force(hand, rows, forces)
-    assert levers.shape == (5, fingers) and greatest.shape == (5,)
-    near(finger_levers(hand, rows[3:]), levers[3:], 1e-12)
+    greatest = greatest_force(hand, rows, forces)
+    assert greatest.shape == (5,)
     near(greatest_force(hand, rows[3:], forces[3:]), greatest[3:], 1e-9)
-    torch.testing.assert_close(finger_levers(small, rows.to(torch.float32)).double(), levers, rtol=1e-4, atol=1e-5)
     found = greatest_force(small, rows.to(torch.float32), forces)
     torch.testing.assert_close(found.double(), greatest, rtol=1e-3, atol=1e-4)
-    assert finger_levers(hand, rows[:0]).shape == (0, fingers)
     assert greatest_force(hand, rows[:0], forces[:0]).shape == (0,)
 
 
