@@ -1,5 +1,7 @@
 """Trials with the features of their grasps, from which the model of success is fitted."""
 
+import hashlib
+import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,8 +11,8 @@ import torch
 from numpy import ndarray as Array
 from tqdm import tqdm
 
-from torchgrasp.data.reader import read_shards
-from torchgrasp.data.shards import JobRow
+from torchgrasp.campaign.folder import ASKED, PARTS
+from torchgrasp.data.shards import JobRow, load_shard
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_tasks
@@ -20,9 +22,6 @@ from torchgrasp.success.model import SuccessModel
 from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.values import Grasps, PointCloud
 from train.trials import BEST, SPREAD, Trial, read_rows
-
-FILE = "features.npz"
-"""Name of the file in a data set that keeps the features of its trials."""
 
 LIMIT = 7200.0
 """Wall time [s] in which the grasps of one data set are measured."""
@@ -55,20 +54,34 @@ class Trials(NamedTuple):
 
 
 def read_trials(folders: Sequence[Path], workers: int = 1) -> Trials:
-    """Return the trials of data sets of `train.trials`, one for each hand; features of an earlier call are read."""
-    missing = [(folder,) for folder in folders if not (folder / FILE).exists()]
+    """Return the trials of data sets of `train.trials`, one for each hand; features of an earlier call are read.
+
+    Of a data set that is not finished, its jobs so far are read.
+    """
+    missing = [(folder,) for folder in folders if not kept_features(folder).exists()]
     for _ in tqdm(run_tasks(measure_folder, missing, workers, LIMIT), total=len(missing), disable=None):
         pass
-    parts = [np.load(folder / FILE) for folder in folders]
+    parts = [np.load(kept_features(folder)) for folder in folders]
     return Trials(*(np.concatenate([part[name] for part in parts]) for name in Trials._fields))
+
+
+def kept_features(folder: Path) -> Path:
+    """Return the file in a data set that keeps these features of its present trials."""
+    names = *FEATURES, *(path.name for path in list_shards(folder))
+    return folder / f"features-{hashlib.sha256(','.join(names).encode()).hexdigest()[:8]}.npz"
+
+
+def list_shards(folder: Path) -> list[Path]:
+    """Return the files of a data set, those of complete shards first."""
+    return [*sorted(folder.glob("*.safetensors")), *sorted((folder / PARTS).glob("*.safetensors"))]
 
 
 def measure_folder(folder: Path) -> None:
     """Measure the grasps of a data set for the tasks of its trials, and keep the result in its folder."""
-    data = read_shards(folder)
-    asked = data.card["asked"]["hand"]
-    found = measure_jobs(load_hand(asked["name"], asked["option"]), read_rows(data))
-    np.savez_compressed(folder / FILE, **found._asdict())
+    asked = json.loads((folder / ASKED).read_text("utf-8"))["hand"]
+    shards = [load_shard(path, {}) for path in list_shards(folder)]
+    found = measure_jobs(load_hand(asked["name"], asked["option"]), read_rows(shards))
+    np.savez_compressed(kept_features(folder), **found._asdict())
 
 
 def measure_jobs(hand: Hand, jobs: Iterable[tuple[JobRow, PointCloud, Grasps, list[Trial]]]) -> Trials:

@@ -6,6 +6,7 @@ trials with `--best` choose the bounds of promises.
 """
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -50,17 +51,22 @@ def success(
         model: file of the model.
     """
     torch.set_num_threads(1)
-    trials = read_trials([folder / hand for folder in folders for hand in HANDS], workers)
+    trials = read_trials(list_hands(folders), workers)
     left = np.isin(trials.family, list(CALIBRATING))
     fitted = fit_model(trials, left)
     print(*judge(fitted, trials.select(left)), sep="\n")
     about = {"fitted_on": f"{(~left).sum()} trials", "calibrated_on": f"{left.sum()} trials of other families"}
     if best:
-        tried = read_trials([folder / hand for folder in best for hand in HANDS], workers)
+        tried = read_trials(list_hands(best), workers)
         fitted = dataclasses.replace(fitted, kept=keep_trials(fitted, tried))
         print("best grasps:", *judge(fitted, tried), sep="\n")
         about["promised_on"] = f"{len(tried.passed)} trials of best grasps"
     print(save_tensors(model, KIND, named_tensors(fitted), about))
+
+
+def list_hands(folders: Iterable[Path]) -> list[Path]:
+    """Return the data set of each hand in folders of `scripts/train.py trials`."""
+    return [folder / hand for folder in folders for hand in HANDS if (folder / hand).exists()]
 
 
 def fit_model(trials: Trials, left: Array) -> SuccessModel:

@@ -8,7 +8,7 @@ For promises, the best grasp for each of a few ordinary tasks is tried instead, 
 
 import dataclasses
 import json
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -214,16 +214,18 @@ def choose_ranks(executable: int, draw: np.random.Generator) -> list[int]:
     return sorted(int(x) for x in np.concatenate(few))
 
 
-def read_rows(data: GraspShards) -> Iterator[tuple[JobRow, PointCloud, Grasps, list[Trial]]]:
+def read_rows(shards: Iterable[Shard]) -> Iterator[tuple[JobRow, PointCloud, Grasps, list[Trial]]]:
     """Yield each job with grasps: its row, cloud, grasps, and its trials."""
-    for k, row in enumerate(data.jobs):
-        if not row.grasps:
-            continue
-        job = data.job(k)
-        said: list[dict[str, Any]] = json.loads(job.row.meta["tasks"])
-        ranks, tasks = json.loads(job.row.meta["ranks"]), [Task(**fields) for fields in said]
-        trials = [
-            Trial(row.object, row.family, rank, task, bool(passed), Status(int(status)))
-            for rank, task, passed, status in zip(ranks, tasks, job.passed[:, 0], job.outcome[:, 0], strict=True)
-        ]
-        yield job.row, job.cloud, job.grasps, trials
+    for shard in shards:
+        for k, row in enumerate(shard.rows):
+            if not row.grasps:
+                continue
+            records = shard.take(k).records
+            said: list[dict[str, Any]] = json.loads(row.meta["tasks"])
+            ranks, tasks = json.loads(row.meta["ranks"]), [Task(**fields) for fields in said]
+            outcomes = zip(ranks, tasks, records.passed[:, 0], records.outcome[:, 0], strict=True)
+            trials = [
+                Trial(row.object, row.family, rank, task, bool(passed), Status(int(status)))
+                for rank, task, passed, status in outcomes
+            ]
+            yield row, PointCloud(records.points, viewpoint=records.viewpoints[0]), records.grasps, trials

@@ -18,7 +18,7 @@ def draw_trials(count: int = 6000, families: int = 30, seed: int = 0) -> tuple[T
     """Return trials whose log-odds depend on two features, and the true probabilities."""
     draw = np.random.default_rng(seed)
     features = draw.uniform(0.0, 1.0, (count, len(FEATURES)))
-    odds = 4.0 - 9.0 * features[:, FEATURES.index("force needed")] + 2.0 * features[:, FEATURES.index("angle to spare")]
+    odds = 4.0 - 9.0 * features[:, FEATURES.index("force needed")] + 2.0 * features[:, FEATURES.index("force to spare")]
     beside = np.stack([features, draw.uniform(0.0, 1.0, features.shape), np.full_like(features, np.nan)], 1)
     chance = 1 / (1 + np.exp(-odds))
     family = np.array([f"family {k:02d}" for k in draw.integers(families, size=count)])

@@ -14,6 +14,7 @@ from train.measured import read_trials
 from train.tasks import FORCE, FRICTION, MASS, Task, draw_ordinary, draw_task
 from train.trials import choose_ranks, read_rows, run_trials
 
+from torchgrasp.data.shards import load_shard
 from torchgrasp.errors import Status
 from torchgrasp.success.features import FEATURES
 
@@ -73,7 +74,7 @@ def test_trials_are_kept_and_read_with_their_tasks(tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "BEST", 1)
     monkeypatch.setattr(runner, "SPREAD", 0)
     data = run_trials("allegro", 1, tmp_path, 0)
-    [(row, cloud, grasps, [trial])] = read_rows(data)
+    [(row, cloud, grasps, [trial])] = read_rows([load_shard(tmp_path / "allegro" / "shard-000000.safetensors", {})])
     assert (row.object, row.status, trial.status in Status) == ("body00000", Status.OK, True)
     assert len(cloud) == row.points and len(grasps) == 1 and trial.rank < 20
     assert json.loads(grasps.meta["ranks"]) == [trial.rank]

@@ -76,7 +76,7 @@ def test_the_force_needed_is_that_of_three_springs_below_the_centre_of_mass():
     needed = found["force needed"]  # at half the friction
     near(needed, real([0.3 * 9.81 / 3 / 0.3]), 0.04)
     forces = least_friction_forces(grasp.contacts.points, grasp.contacts.normals, strongest=1.0)
-    gripped = torch.minimum(greatest_force(hand, grasp, forces), real([15.0]))  # as strong as the load asks for, at most
+    gripped = torch.minimum(greatest_force(hand, grasp, forces), real([15.0]))  # at most
     near(found["force to spare"], torch.log(gripped / needed), 1e-9)
     pressed = measure(hand, grasp, vertices=still, mass=0.3, force=2.0)
     near(pressed["force to spare"], torch.log(2.0 / needed), 1e-9)

@@ -1,6 +1,7 @@
 """Contacts of displaced objects: on a ball by geometry, and their forces by balance."""
 
 import dataclasses
+
 import pytest
 import torch
 
@@ -89,4 +90,5 @@ def test_fingers_that_pass_by_the_object_touch_nothing():
     hand, grasps = grasps_at(around(0.01))
     away = rigid(torch.eye(3, dtype=torch.float64), real([1.0, 0.0, 0.0]))[None]
     forces = least_friction_forces(grasps.contacts.points, grasps.contacts.normals, strongest=1.0)
-    assert not bool(touch_moved(hand, ball_field(), dataclasses.replace(grasps, obj_from_hand=away), forces).touched.any())
+    far = dataclasses.replace(grasps, obj_from_hand=away)
+    assert not bool(touch_moved(hand, ball_field(), far, forces).touched.any())

@@ -48,31 +48,24 @@ def next_grasp(grasps: Grasps, tried: Sequence[int], surface: SignedDistanceFiel
 @checked
 def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
     """Return the rows of the grasps that differ from all `tried`: by 30 degrees in approach, or 15 mm in contacts."""
-    approach = grasps.approach
-    differs = (_gaps(grasps, tried) > 0.015) | (approach @ approach[list(tried)].T < math.cos(math.radians(30)))
+    approach, points = grasps.approach, grasps.contacts.points.double()
+    gaps = torch.linalg.vector_norm(points[:, None] - points[list(tried)], dim=-1).mean(-1)
+    differs = (gaps > 0.015) | (approach @ approach[list(tried)].T < math.cos(math.radians(30)))
     return differs.all(-1).nonzero()[:, 0]
-
-
-def _gaps(grasps: Grasps, tried: Sequence[int]) -> Float[Tensor, "g t"]:
-    """Return the mean distance [m] of the contacts of each grasp from those of each tried grasp."""
-    points = grasps.contacts.points.double()
-    return torch.linalg.vector_norm(points[:, None] - points[list(tried)], dim=-1).mean(-1)
 
 
 def _chances(grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]) -> Float[Tensor, "g"]:
     """Return each grasp's probability of success given that the tried ones failed; 0 if it is unknown.
 
-    A share of the mass may be at any point of the surface, which may explain the failures. Besides, log-odds fall near
-    the contacts of the tried grasps.
+    A share of the mass may be at any point of the surface, which may explain the failures.
     """
-    share, count, fall, width = 0.35, 64, 2.0, 0.04  # of mass; places; of log-odds; [m]
+    share, count = 0.35, 64  # of mass; places
     shell = (surface.values.abs() < surface.spacing).nonzero().double()
     places = surface.origin.double() + surface.spacing * shell[:: max(1, len(shell) // count)]
     middle = places.mean(0)
     centers = torch.cat([middle[None], middle + share * (places - middle)])
     log_odds = log_odds_about(grasps, centers, float(grasps.meta["friction"]), (-table.normal).tolist())
     weight = torch.sigmoid(-log_odds[list(tried)]).prod(0)
-    log_odds = log_odds - fall * torch.exp(-0.5 * (_gaps(grasps, tried) / width) ** 2).sum(-1, keepdim=True)
     return (torch.sigmoid(log_odds) @ weight / weight.sum()).where(grasps.success > 0, 0.0)
 
 
