@@ -77,7 +77,7 @@ def test_trials_are_kept_and_read_with_their_tasks(tmp_path, monkeypatch):
     [(row, cloud, grasps, [trial])] = read_rows([load_shard(tmp_path / "allegro" / "shard-000000.safetensors", {})])
     assert (row.object, row.status, trial.status in Status) == ("body00000", Status.OK, True)
     assert len(cloud) == row.points and len(grasps) == 1 and trial.rank < 20
-    assert json.loads(grasps.meta["ranks"]) == [trial.rank]
+    assert json.loads(row.meta["ranks"]) == [trial.rank]
     measured = read_trials([tmp_path / "allegro"])
     assert (measured.passed.tolist(), measured.rank.tolist()) == ([trial.passed], [trial.rank])
     columns = dict(zip(FEATURES, measured.features[0], strict=True))
