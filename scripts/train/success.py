@@ -58,6 +58,7 @@ def success(
     about = {"fitted_on": f"{(~left).sum()} trials", "calibrated_on": f"{left.sum()} trials of other families"}
     if best:
         tried = read_trials(list_hands(best), workers)
+        tried = tried.select(tried.features[:, FEATURES.index("displaced")] == 0)  # no promise is made of others
         fitted = dataclasses.replace(fitted, kept=keep_trials(fitted, tried))
         print("best grasps:", *judge(fitted, tried), sep="\n")
         about["promised_on"] = f"{len(tried.passed)} trials of best grasps"
