@@ -17,9 +17,9 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_tasks
 from torchgrasp.shape.fit import fit_shape
+from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import FEATURES, measure_grasps
 from torchgrasp.success.model import SuccessModel
-from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.values import Grasps, PointCloud
 from train.trials import BEST, SPREAD, Trial, read_rows
 

@@ -37,9 +37,9 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.specs import ContactSpec
+from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import measure_grasps
 from torchgrasp.success.model import MODEL, load_model
-from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.success.order import is_known
 from torchgrasp.values import Grasps, PointCloud
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of

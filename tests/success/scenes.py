@@ -10,9 +10,9 @@ from torchgrasp.geometry.frames import rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.shape.surface import collision_field, extract_mesh
+from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import SuccessModel
-from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.values import Certificate, Contacts, Grasps
 
 RADIUS = 0.04

@@ -32,7 +32,7 @@ from torchgrasp.shape.fit import FitOptions, fit_upright
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
 from torchgrasp.specs import ContactSpec
-from torchgrasp.success.moved import EstimatedBody
+from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.promise import describe_promise
 from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud
 

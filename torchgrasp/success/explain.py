@@ -11,9 +11,9 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import CAUSES, measure_grasps
 from torchgrasp.success.model import load_model
-from torchgrasp.success.moved import EstimatedBody
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values import Grasps
 

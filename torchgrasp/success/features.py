@@ -10,8 +10,9 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.forces import least_friction_forces
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.loads import carrying_force, greatest_force
-from torchgrasp.success.moved import EstimatedBody, Touches, touch_moved
+from torchgrasp.success.moved import Touches, touch_moved
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values import Contacts, Grasps
 

@@ -11,31 +11,9 @@ from torchgrasp.geometry.linalg import fibonacci_sphere
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.forces import forces_near, internal_forces
-from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.surface import collision_field, extract_mesh
 from torchgrasp.values import Contacts, Grasps
 
 Sets = Float[Tensor, "d g f 3"]
-
-
-class EstimatedBody(NamedTuple):
-    """What the planner knows of an object, in an upright frame, whose z axis points up.
-
-    Args:
-        shape: the posterior.
-        vertices: of the estimated surface [m]; their mean is taken for the centre of mass.
-        field: signed distances from the estimated surface.
-    """
-
-    shape: ShapeGP
-    vertices: Float[Tensor, "v 3"]
-    field: SignedDistanceField
-
-    @classmethod
-    def of(cls, shape: ShapeGP) -> "EstimatedBody":
-        """Return the body of a shape in an upright frame."""
-        mesh = extract_mesh(shape)
-        return cls(shape, mesh.vertices, collision_field(shape, mesh))
 
 
 class Touches(NamedTuple):
@@ -57,7 +35,7 @@ def touch_moved(hand: Hand, field: SignedDistanceField, grasps: Grasps, forces: 
     contacts tell how the fingers share their pushes.
     """
     count, radius = 16, 0.02  # displacements; the greatest [m]
-    sizes = (torch.arange(count, dtype=torch.float64) * 0.618 % 1.0) ** (1 / 3)  # even in the ball
+    sizes = (torch.arange(count, dtype=torch.float64, device="cpu") * 0.618 % 1.0) ** (1 / 3)  # even in the ball
     moved = radius * (sizes[:, None] * fibonacci_sphere(count)).to(forces)
     pose = grasps.obj_from_hand.to(forces)
     before, after = (apply(pose, hand.tip_centres(q).to(forces)) for q in (grasps.pregrasp, grasps.joints))
