@@ -54,8 +54,8 @@ def explain_success(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> shape, grasp = fit_shape(load_object("jug").view, table=0.0), load_shipped_grasp("jug", "barrett")
     >>> costs = explain_success(grasp, load_hand("barrett"), shape, GraspTask(mass=0.5))
-    >>> len(costs), bool(costs[0].log_odds >= costs[-1].log_odds > 0)
-    (3, True)
+    >>> costs[0].cause, bool(costs[0].log_odds >= costs[-1].log_odds > 0)
+    ('task', True)
     """
     if not len(grasps) or "friction" not in grasps.meta:
         raise BadArgument("grasps", f"{len(grasps)} grasps, planned for no friction", "grasps of plan_grasps")
