@@ -19,7 +19,7 @@ from torchgrasp.values import Grasps
 
 SENTENCES = {
     "load": "at half the friction the load takes {force needed} of a finger; its centre is {offset} from the contacts",
-    "moved": "the fingers carry the load in a share of {carried if moved} of the places within 20 mm of the object",
+    "moved": "the fingers carry the load at a share {carried if moved} of the places within 20 mm of the object",
     "surface": "the surface may be {deviation} off at a contact",
     "object": "the object is {height} high and {size} in radius",
     "task": "the task is {mass} at a friction of {friction}",

@@ -37,8 +37,9 @@ def measure_grasps(
 ) -> Float[Tensor, "g k"]:
     """Return the `FEATURES` of each grasp for a task, at the friction coefficient `friction`.
 
-    Body and grasps are in an upright frame. `lifted` tells whether the task is a lift or pulls. Forces are spared as
-    logarithms of the fingers' strength over the force needed; "force needed" and "slippery" mean half the friction.
+    Body and grasps are in an upright frame. `lifted` tells whether the task is a lift or pulls. A force to spare is the
+    logarithm of the fingers' strength over the force needed. "force needed", "force to spare" and "slippery" are at
+    half the friction.
     """
     shape, vertices = body.shape, body.vertices
     contacts, g = grasps.contacts, len(grasps)
