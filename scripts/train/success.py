@@ -31,7 +31,7 @@ TREES = {
 }  # fmt: skip
 """Parameters of the boosted trees; families left out of the fit chose them."""
 
-RISES = ("force to spare", *(name for name in CAUSES["moved"]), "friction")
+RISES = ("force to spare", *CAUSES["moved"], "friction")
 FALLS = ("force needed", "mass", "displaced", "deviation", "tilt")
 """Features that never lower the prediction when they rise, or never raise it."""
 

@@ -95,7 +95,7 @@ def test_the_force_to_spare_where_the_body_is_moved_is_the_mean_over_the_displac
         rows = slice(k * len(grasps), (k + 1) * len(grasps))
         contacts = moved.contacts[rows]
         for friction, mine in spare.items():
-            needed = carrying_force(contacts, moved.forces[rows], VERTICES.mean(0), friction, down, pull)
+            needed = carrying_force(contacts, moved.forces[rows], VERTICES.mean(0), (friction,), down, pull)[0]
             mine.append(torch.log(strength / needed.clamp(1e-3, 1e3)).where(touched, -9.0))
     full, half = (torch.stack(x) for x in spare.values())
     near(found["carried if moved"], (full > 0).double().mean(0), 1e-9)

@@ -44,7 +44,7 @@ def test_the_force_that_carries_a_load_is_the_least_with_which_no_contact_slides
     points = 0.06 * normals + 0.05 * torch.randn(40, 3, 3, generator=generator, dtype=torch.float64)
     load, center = real([0.5, 0.3, -2.0]), real([0.01, 0.0, -0.02])
     balanced = least_friction_forces(points, normals)
-    found = carrying_force(Contacts(points, normals), balanced, center, 0.8, load, push)
+    found = carrying_force(Contacts(points, normals), balanced, center, (0.8,), load, push)[0]
     pushes = push * unit(torch.randn(4000 if push else 1, 3, generator=generator, dtype=torch.float64)).numpy()
     ratio = tangential_ratio(balanced, normals).amax(-1).nan_to_num(torch.inf)
     assert bool(torch.isinf(found[ratio > 0.81]).all()) and int((ratio < 0.75).sum()) > 5

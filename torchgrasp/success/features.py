@@ -1,6 +1,7 @@
 """What decides whether a grasp holds its task: numbers that physics names, one column each, in SI units."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -12,7 +13,7 @@ from torchgrasp.plan.forces import least_friction_forces
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.loads import carrying_force, greatest_force
-from torchgrasp.success.moved import Touches, touch_moved
+from torchgrasp.success.moved import touch_moved
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values import Contacts, Grasps
 
@@ -48,17 +49,19 @@ def measure_grasps(
     forces, pressing = least_friction_forces(points, normals, strongest=1.0), task.pressing(lifted)
     greatest = greatest_force(hand, grasps, forces).to(points).nan_to_num(0.0)
     strength = torch.minimum(greatest, greatest.new_tensor(pressing or GRIP))
-    needed = _force_for(contacts, forces, center, 0.5 * friction, task.mass, lifted)
+    needed = _force_for(contacts, forces, center, (0.5 * friction,), task.mass, lifted)[0]
     moved = touch_moved(hand, body.field, grasps, forces)
-    spare = [_spare_if_moved(moved, strength, center, x, task.mass, lifted) for x in (friction, 0.5 * friction)]
+    there = _force_for(moved.contacts, moved.forces, center, (friction, 0.5 * friction), task.mass, lifted)
+    there = there.unflatten(1, moved.touched.shape).where(moved.touched, 1e3)
+    spare, slippery = torch.log(strength.clamp_min(1e-3) / there)
     spread = torch.linalg.svdvals(vertices[:, :2] - center[:2]) / math.sqrt(len(vertices))
     found: dict[str, Tensor | float] = {
         "force needed": needed,
         "force to spare": torch.log(strength.clamp_min(1e-3) / needed),
         "offset": torch.linalg.vector_norm(points.mean(1) - center, dim=-1),
-        "force to spare if moved": spare[0].clamp(-2.0, 2.0).mean(0),
-        "force to spare if moved and slippery": spare[1].clamp(-2.0, 2.0).mean(0),
-        "carried if moved": (spare[0] > 0).to(points).mean(0),
+        "force to spare if moved": spare.clamp(-2.0, 2.0).mean(0),
+        "force to spare if moved and slippery": slippery.clamp(-2.0, 2.0).mean(0),
+        "carried if moved": (spare > 0).to(points).mean(0),
         "deviation": contacts.require_std().to(points).amax(1),
         "tilt": _normal_deviation(shape, points).amax(1),
         "size": shape.scale,
@@ -77,21 +80,13 @@ def measure_grasps(
 
 
 def _force_for(
-    contacts: Contacts, forces: Float[Tensor, "g f 3"], center: Float[Tensor, "3"], friction: float, mass: float,
-    lifted: bool,
-) -> Float[Tensor, "g"]:  # fmt: skip
-    """Return the force [N] of the strongest finger with which no contact slides under the task's load."""
+    contacts: Contacts, forces: Float[Tensor, "g f 3"], center: Float[Tensor, "3"], frictions: Sequence[float],
+    mass: float, lifted: bool,
+) -> Float[Tensor, "m g"]:  # fmt: skip
+    """Return the force [N] of the strongest finger with which no contact slides under the load, for each friction."""
     weight, pull = (9.81 * mass, 0.0) if lifted else (0.0, 10.0 * mass)
     load = center.new_tensor([0.0, 0.0, -weight])
-    return carrying_force(contacts, forces, center, friction, load, pull).clamp(1e-3, 1e3)  # infinite: no force does
-
-
-def _spare_if_moved(
-    moved: Touches, strength: Float[Tensor, "g"], center: Float[Tensor, "3"], friction: float, mass: float, lifted: bool
-) -> Float[Tensor, "d g"]:
-    """Return for each displacement the logarithm of the fingers' strength over the force needed."""
-    needed = _force_for(moved.contacts, moved.forces, center, friction, mass, lifted).view(moved.touched.shape)
-    return torch.log(strength.clamp_min(1e-3) / needed.where(moved.touched, 1e3))
+    return carrying_force(contacts, forces, center, frictions, load, pull).clamp(1e-3, 1e3)  # infinite: no force does
 
 
 def _normal_deviation(shape: ShapeGP, points: Float[Tensor, "g f 3"]) -> Float[Tensor, "g f"]:

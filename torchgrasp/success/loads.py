@@ -36,26 +36,30 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
 
 
 def carrying_force(
-    contacts: Contacts, forces: Float[Tensor, "b f 3"], center: Float[Tensor, "3"], friction: float,
+    contacts: Contacts, forces: Float[Tensor, "b f 3"], center: Float[Tensor, "3"], frictions: Sequence[float],
     load: Float[Tensor, "3"], push: float = 0.0,
-) -> Float[Tensor, "b"]:  # fmt: skip
-    """Return the least factor s on balanced forces f_0 so that all contacts stick under a load and any push [N].
+) -> Float[Tensor, "m b"]:  # fmt: skip
+    """Return for each of m friction coefficients the least factor s on balanced forces f_0 at which all contacts stick.
 
-    Load and push of any direction act at `center`; w is their wrench. Equal springs share it, G being the grasp map:
+    Load and push of any direction [N] act at `center`; w is their wrench. Equal springs share it, with the grasp map G:
 
         f = s f_0 - G^+ w,    y . f >= 0 for all edges y of the cones dual to the friction cones.
 
     The factor is infinite if the forces do not stick at all, as where no forces balance.
     """
     points, normals = contacts.points.to(forces), contacts.normals.to(forces)
-    dual = cone_edges(normals, tangents(points, normals), 1.0, edges=32) + (1 - friction) * normals[:, :, None]
+    edges = cone_edges(normals, tangents(points, normals), 1.0, edges=32)
     moment = skew(center.to(forces) - points.mean(1))  # maps a force at `center` to its torque
     eye = torch.eye(3).to(forces).expand_as(moment)
     shared = (torch.linalg.pinv(grasp_map(points)) @ torch.cat([eye, moment], 1)).unflatten(1, points.shape[1:])
-    across = torch.einsum("bfij,bfei->bfej", shared, dual)
-    lacking = across @ load.to(forces) + push * torch.linalg.vector_norm(across, dim=-1)
-    having = torch.einsum("bfi,bfei->bfe", forces, dual)
-    return torch.where(having > 0, lacking.clamp_min(0) / having, torch.inf).amax((1, 2))
+    found = list[Tensor]()
+    for friction in frictions:
+        dual = edges + (1 - friction) * normals[:, :, None]
+        across = torch.einsum("bfij,bfei->bfej", shared, dual)
+        lacking = across @ load.to(forces) + push * torch.linalg.vector_norm(across, dim=-1)
+        having = torch.einsum("bfi,bfei->bfe", forces, dual)
+        found.append(torch.where(having > 0, lacking.clamp_min(0) / having, torch.inf).amax((1, 2)))
+    return torch.stack(found)
 
 
 def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Float[Tensor, "g"]:
@@ -77,6 +81,6 @@ def log_odds_about(
     """
     points, normals = grasps.contacts.points.to(centers), grasps.contacts.normals.to(centers)
     forces, load = least_friction_forces(points, normals, strongest=1.0), centers.new_tensor(weight)
-    carried = [carrying_force(grasps.contacts, forces, center, 0.5 * friction, load) for center in centers]
+    carried = [carrying_force(grasps.contacts, forces, center, (0.5 * friction,), load)[0] for center in centers]
     logs = torch.log(torch.stack(carried, -1).clamp(0.3, 100.0))
     return grasps.score.to(centers)[:, None] - CARRYING * (logs - logs[:, :1])

@@ -17,9 +17,9 @@ Sets = Float[Tensor, "d g f 3"]
 
 
 class Touches(NamedTuple):
-    """Contact sets of g grasps after each of d displacements, one after another, with balanced `forces` of any scale.
+    """Contact sets of g grasps after each of d displacements, one after another, with balanced `forces`.
 
-    `touched` tells whether all fingers touch the object, and can press it.
+    The strongest force pushes with 1 N. `touched` tells whether all fingers touch the object, and can press it.
     """
 
     contacts: Contacts
@@ -39,7 +39,8 @@ def touch_moved(hand: Hand, field: SignedDistanceField, grasps: Grasps, forces: 
     moved = radius * (sizes[:, None] * fibonacci_sphere(count)).to(forces)
     pose = grasps.obj_from_hand.to(forces)
     before, after = (apply(pose, hand.tip_centres(q).to(forces)) for q in (grasps.pregrasp, grasps.joints))
-    way = (after - before) / torch.linalg.vector_norm(after - before, dim=-1, keepdim=True).clamp_min(1e-6)
+    path = after - before
+    way = path / torch.linalg.vector_norm(path, dim=-1, keepdim=True).clamp_min(1e-6)
     start = before - rotate(pose, moved[None]).transpose(0, 1)[:, :, None]
     points, normals, found = trace(field, start, way.expand_as(start), hand.tips.radius.to(forces))
     pairs = internal_forces(grasps.contacts.points.to(forces)).flatten(2).mT
