@@ -174,6 +174,22 @@ def test_scene_pulls_at_the_mass_centre_and_lifts_at_a_speed(simulator):
 
 
 @simulated
+def test_skipped_steps_are_the_steps_that_are_watched(simulator):
+    poses = []
+    for skips in (False, True):
+        *_, scene = build("allegro", standing(), simulator)
+        scene.pull(np.array([0.05, 0.0, 0.0]))
+        if skips:
+            scene.skip(120)
+        else:
+            for _ in range(120):
+                scene.step()
+        poses.append(np.concatenate([scene.object_pose().ravel(), scene.joints()]))
+    assert np.array_equal(*poses)
+    assert not np.array_equal(poses[0][:16].reshape(4, 4), np.eye(4))
+
+
+@simulated
 def test_open_scene_refuses_joints_without_a_drive(simulator):
     pytest.importorskip(simulator)
     mesh, hand = standing(), load_hand("barrett")

@@ -97,8 +97,7 @@ def _pull(run: TrialRun, spec: PullSpec, start: np.ndarray, direction: np.ndarra
     run.scene.pull(spec.acceleration * run.mass * direction)
     status, largest = Status.OK, np.zeros(2)
     for _ in range(round(spec.seconds / interval)):
-        for _ in range(run.robot.ticks(interval)):
-            run.step()
+        run.hold(interval)
         status, motion = _look(run, spec, start)
         largest = np.maximum(largest, motion)
         if status is not Status.OK:

@@ -17,6 +17,7 @@ from torchgrasp.closure import SensorModel
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding import GripHold
+from torchgrasp.control.paper.closings import OpenLoopClosing
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
@@ -242,6 +243,15 @@ class TrialRun:
         if self.spec.approach:
             self.scene.approach(targets.left, (left - targets.left) / self.robot.period)
         self.observation = self.robot.tick(targets)
+
+    def hold(self, seconds: float) -> None:
+        """Hold the object for a time; a hand that closed in open loop keeps its targets, whatever it would observe."""
+        ticks = self.robot.ticks(seconds)
+        if isinstance(self.controller.closing, OpenLoopClosing) and self.controller.closing.done:
+            self.robot.rest(ticks)
+            return
+        for _ in range(ticks):
+            self.step()
 
     @property
     def felt(self) -> tuple[float, float]:

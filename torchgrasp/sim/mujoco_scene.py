@@ -64,14 +64,28 @@ class MujocoScene(Scene):
 
     def _advance(self) -> Iterator[tuple[int, int, tuple[int, np.ndarray, np.ndarray]]]:
         """Advance by one timestep; yield each pair of bodies that touch, with number, axes and place of the contact."""
-        if any(self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].tolist()):  # it has diverged
-            self.data.qpos[:] = self.data.xpos[:] = np.nan
+        if self._diverged():
             return
         self._mujoco.mj_step2(self.model, self.data)
         found = self.data.contact
         for k, (first, second) in enumerate(found.geom.tolist()):
             yield self._body_of[first], self._body_of[second], (k, found.frame[k], found.pos[k])
         self._mujoco.mj_step1(self.model, self.data)
+
+    def skip(self, steps: int) -> None:
+        """Advance by a number of timesteps, of whose contacts nobody asks."""
+        for _ in range(steps):
+            if self._diverged():
+                return
+            self._mujoco.mj_step2(self.model, self.data)
+            self._mujoco.mj_step1(self.model, self.data)
+
+    def _diverged(self) -> bool:
+        """Return whether the simulation has diverged; then positions are NaN."""
+        diverged = any(self.data.warning.number[self._mujoco.mjtWarning.mjWARN_BADQPOS :].tolist())
+        if diverged:
+            self.data.qpos[:] = self.data.xpos[:] = np.nan
+        return diverged
 
     def _read(self, contact: tuple[int, np.ndarray, np.ndarray], sign: float) -> list[tuple[float, list[float]]]:
         """Return size and numbers of MuJoCo's contact point, as a list of one."""

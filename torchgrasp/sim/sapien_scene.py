@@ -89,6 +89,11 @@ class SapienScene(Scene):
             self.body.add_force_torque(self._force, self._torque)
         self.system.step()
 
+    def skip(self, steps: int) -> None:
+        """Advance by a number of timesteps, of whose contacts nobody asks."""
+        for _ in range(steps):
+            self._simulate()
+
     def _advance(self) -> Iterator[tuple[Any, Any, Any]]:
         """Advance by one timestep; yield each pair of bodies that touch, with their contact."""
         self._simulate()

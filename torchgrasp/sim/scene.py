@@ -83,6 +83,10 @@ class Scene(abc.ABC):
         return StepContacts(found[:, :3], found[:, 3:6], found[:, 6], np.array(finger), found[:, 7:], np.array(stray))
 
     @abc.abstractmethod
+    def skip(self, steps: int) -> None:
+        """Advance by a number of timesteps, of whose contacts nobody asks."""
+
+    @abc.abstractmethod
     def _advance(self) -> Iterable[tuple[Any, Any, Any]]:
         """Advance by one timestep; yield each pair of bodies that touch, with an argument of `_read`."""
 

@@ -109,6 +109,11 @@ class SimulatedHand:
         self.most_stray = np.maximum(self.most_stray, (self.stray - before) / self.period)
         return self._observe(impulse, moment, weight)
 
+    def rest(self, ticks: int) -> None:
+        """Keep the targets for a number of control ticks that nobody observes."""
+        self.scene.skip(ticks * self.substeps)
+        self.steps += ticks * self.substeps
+
     def unbalanced(self) -> float:
         """Return the size of the sum of all fingertip forces over the sum of their sizes; NaN without any forces."""
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
