@@ -109,7 +109,8 @@ class SimulatedHand:
         self.most_stray = np.maximum(self.most_stray, (self.stray - before) / self.period)
         return self._observe(impulse, moment, weight)
 
-    def rest(self, ticks: int) -> None:
+    @checked
+    def rest(self, ticks: Annotated[int, Range(1, 1000000)]) -> None:
         """Keep the targets for a number of control ticks that nobody observes."""
         self.scene.skip(ticks * self.substeps)
         self.steps += ticks * self.substeps
