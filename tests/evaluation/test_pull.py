@@ -12,6 +12,7 @@ from torchgrasp.control import squeeze
 from torchgrasp.control.forces import joint_stiffness
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, pull_grasp
+from torchgrasp.evaluation.trial import TrialRun
 from torchgrasp.geometry.frames import apply, inverse
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
@@ -105,3 +106,20 @@ def test_bad_arguments_are_named():
         Truth(cylinder(), error=torch.full((4, 4), math.nan))
     with pytest.raises(BadArgument, match=r"grasps: expected .*got 12 joints"):
         squeeze(pinch("barrett")[0], grasp)
+
+
+def test_a_pull_in_open_loop_is_the_same_whether_the_hand_observes_or_not(monkeypatch):
+    """At this rate the closing ends in a tick that comes before its last target is reached."""
+    pytest.importorskip("mujoco")
+
+    def found():
+        result = pull("barrett", simulator="mujoco", closing="open_loop", control_rate=1 / 0.006)
+        return result.status, result.directions, result.moved, result.turned, result.force
+
+    def observe(run, seconds):
+        for _ in range(run.robot.ticks(seconds)):
+            run.step()
+
+    rests = found()
+    monkeypatch.setattr(TrialRun, "hold", observe)
+    assert found() == rests

@@ -245,13 +245,17 @@ class TrialRun:
         self.observation = self.robot.tick(targets)
 
     def hold(self, seconds: float) -> None:
-        """Hold the object for a time; a hand that closed in open loop keeps its targets, whatever it would observe."""
+        """Hold the object for a time.
+
+        A hand that closed in open loop reaches its last targets one tick after its closing ends. Then it keeps them,
+        whatever it would observe.
+        """
         ticks = self.robot.ticks(seconds)
-        if isinstance(self.controller.closing, OpenLoopClosing) and self.controller.closing.done:
-            self.robot.rest(ticks)
-            return
-        for _ in range(ticks):
+        rests = isinstance(self.controller.closing, OpenLoopClosing) and self.controller.closed
+        for _ in range(1 if rests else ticks):
             self.step()
+        if rests:
+            self.robot.rest(ticks - 1)
 
     @property
     def felt(self) -> tuple[float, float]:

@@ -110,7 +110,7 @@ class SimulatedHand:
         return self._observe(impulse, moment, weight)
 
     @checked
-    def rest(self, ticks: Annotated[int, Range(1, 1000000)]) -> None:
+    def rest(self, ticks: Annotated[int, Range(0, 1000000)]) -> None:
         """Keep the targets for a number of control ticks that nobody observes."""
         self.scene.skip(ticks * self.substeps)
         self.steps += ticks * self.substeps
