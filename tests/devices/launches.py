@@ -105,16 +105,18 @@ class Launches(TorchDispatchMode):
 
 def place(frame: FrameType | None, stages: dict[str, str]) -> Place:
     """Return the innermost line of the library above a frame, and its stage."""
-    where, stage = None, None
-    while frame is not None and (where is None or stage is None):
+    file, line, function, stage = "", 0, "", ""
+    while frame is not None and not (file and function and stage):
         code = frame.f_code
         if code.co_filename.startswith(LIBRARY):
             name = code.co_filename[len(LIBRARY) :]
-            if where is None and name not in HELPERS:
-                where = name, frame.f_lineno, code.co_name
-            stage = stage or stages.get(code.co_name)
+            if not file and name not in HELPERS:
+                file, line = name, frame.f_lineno
+            if not function and name == file and not code.co_name.startswith("<"):  # a list is made in its function
+                function = code.co_name
+            stage = stage or stages.get(code.co_name, "")
         frame = frame.f_back
-    return Place(*(where or ("outside", 0, "")), stage or "other")
+    return Place(file or "outside", line, function, stage or "other")
 
 
 @cache
