@@ -47,7 +47,7 @@ class Place(NamedTuple):
 class Launches(TorchDispatchMode):
     """Counts in `found`, by kind and place, what the calls inside the context would do on a GPU.
 
-    The kinds are "launch", "read" and "upload". The kind "host" counts operations on the CPU's own tensors.
+    The kinds are "launch", "read" and "upload".
 
     Args:
         stages: name of the stage of each function of the planner; the innermost one counts.
@@ -71,8 +71,7 @@ class Launches(TorchDispatchMode):
         """Run one operation, and count it."""
         kwargs = kwargs or {}
         result = func(*args, **kwargs)
-        if not TRAFFIC.running:
-            self.note("host")
+        if not TRAFFIC.running:  # work of the host
             return result
         for _ in range(reads(func, args, kwargs)):
             self.note("read")
@@ -80,9 +79,9 @@ class Launches(TorchDispatchMode):
             self.note("launch")
         return result
 
-    def note(self, kind: str, times: int = 1) -> None:
+    def note(self, kind: str) -> None:
         """Count an event at the present place."""
-        self.found[kind, place(sys._getframe(1), self.stages)] += times
+        self.found[kind, place(sys._getframe(1), self.stages)] += 1
 
     def total(self, kind: str) -> int:
         """Return the number of events of a kind."""

@@ -6,15 +6,15 @@ The planner runs on the pretended device of `tests/devices`, which computes on t
 import sys
 from collections.abc import Iterable
 
-from benchmarks.common import ROOT, Options, Row, bench
 from golden import OBJECTS, see
 
+from benchmarks.common import ROOT, Options, Row, bench
 from torchgrasp import ContactSpec, Hand, PointCloud, load_hand, plan_grasps
 
 sys.path.append(str(ROOT))
 
-from tests.devices.elsewhere import DEVICE, pretend  # noqa: E402
-from tests.devices.launches import Launches, Place  # noqa: E402
+from tests.devices.elsewhere import DEVICE, pretend
+from tests.devices.launches import Launches, Place
 
 KINDS = ("launch", "read", "upload")
 PLANNED = 16
@@ -67,7 +67,7 @@ def count_plans(hand: Hand, clouds: list[PointCloud], starts: int) -> Launches:
 
 def say(counts: Iterable[float]) -> str:
     """Return the numbers of launches, reads and uploads as text."""
-    return ", ".join(f"{count:.0f} {kind}" for count, kind in zip(counts, ("launches", "reads", "uploads"), strict=True))
+    return "{:.0f} launches, {:.0f} reads, {:.0f} uploads".format(*counts)
 
 
 def batch_row(batch: int, counted: Launches, size: int, hand: Hand, starts: int) -> Row:
