@@ -44,7 +44,9 @@ def count_launches(o: Options) -> list[Row]:
     rows = [batch_row(batch, *counted, hand, o.starts) for batch, counted in counts.items()]
     for stage in STAGES:
         texts = {batch: say([n.by_stage(kind)[stage] / size for kind in KINDS]) for batch, (n, size) in counts.items()}
-        rows.append(Row(f"stage {stage}", "-", "; ".join(f"batch {b}: {x}" for b, x in texts.items()), None, texts))
+        rows.append(
+            Row(f"stage {stage}", "-", "; ".join(f"batch {b}: {x}" for b, x in texts.items()), None, {"batches": texts})
+        )
     last, size = list(counts.values())[-1]
     return rows + [lines_row(kind, last.most(kind, 10), size) for kind in KINDS]
 
