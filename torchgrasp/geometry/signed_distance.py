@@ -37,10 +37,9 @@ class SignedDistanceField(Value):
     @kept
     def _cells(self) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
         """The last node along each axis, and the steps from the first corner of a cell to all corners in `values`."""
-        _, ny, nz = self.values.shape
-        steps = [i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-        last = torch.tensor([n - 1 for n in self.values.shape], device=self.values.device)
-        return last, torch.tensor(steps, device=self.values.device)
+        shape, corner = self.values.shape, torch.arange(8, device=self.values.device)
+        last = torch.tensor(shape, device=corner.device) - 1
+        return last, (corner // 4 * shape[1] + corner // 2 % 2) * shape[2] + corner % 2
 
     @checked
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:

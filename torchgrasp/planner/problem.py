@@ -202,11 +202,9 @@ class Problem:
 
 def settle_hand(hand: Hand, device: torch.device) -> Hand:
     """Return the hand on a device; the hand caches a copy on another device, with the caches of the copy."""
-    if hand.lower.device == device:
-        return hand
-    if device not in hand.derived:
+    if hand.lower.device != device and device not in hand.derived:
         hand.derived[device] = hand.to(device)
-    return hand.derived[device]
+    return hand.derived.get(device, hand)
 
 
 @checked
