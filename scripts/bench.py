@@ -2,7 +2,7 @@
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
 close  misplaced, sensors, perturb, table-lift, holding, speed, success: closing and lifting in simulation
-gpu    kernels: every kernel of the chain on a GPU beside the CPU
+gpu    kernels, launches: every kernel of the chain on a GPU beside the CPU; launches and waits, counted without a GPU
 hand   fk, collision, codes: kinematics beside pytorch-kinematics, self-collision and inverse kinematics
 load   plans, trials, points, starts: memory over many plans and trials, and of large inputs
 plan   truth, fields, executable, certificates: the contact planner on the true surface and in exact arithmetic

@@ -1,7 +1,6 @@
 """What the tests of devices share: the pretended device, and one planned object."""
 
 import dataclasses
-from concurrent.futures import Future
 from typing import Any
 
 import pytest
@@ -13,26 +12,8 @@ from torchgrasp import ContactSpec, Grasps, Hand, ShapeGP, fit_shape, load_hand,
 from torchgrasp.base import Value
 
 
-class SerialPool:
-    """A pool of one thread, the caller's: the pretended device is known there alone."""
-
-    def __init__(self, *arguments: Any) -> None: ...
-    def __enter__(self) -> "SerialPool":
-        return self
-
-    def __exit__(self, *error: Any) -> None: ...
-    def map(self, function: Any, *values: Any) -> Any:
-        return map(function, *values)
-
-    def submit(self, function: Any, *values: Any) -> Future:
-        future: Future = Future()
-        future.set_result(function(*values))
-        return future
-
-
 @pytest.fixture
-def device(monkeypatch):
-    monkeypatch.setattr("torchgrasp.posture_model.sample.ThreadPoolExecutor", SerialPool)
+def device():
     with pretend():
         yield
 

@@ -2,11 +2,15 @@
 
 `Elsewhere` behaves like a tensor of `DEVICE`. An operation on tensors of both devices is an error, as is
 `numpy()`, a draw there by a generator of the CPU, or an index from there into a tensor of the CPU. `pretend` makes
-`device=DEVICE` work.
+`device=DEVICE` work. `TRAFFIC` says when a function runs there, and tells what crosses the border of the devices.
 """
 
-from collections.abc import Iterator
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from typing import Any
+from unittest import mock
 
 import torch
 from torch import Tensor
@@ -23,6 +27,36 @@ DATA |= {"dim", "size", "stride", "numel", "is_contiguous", "is_floating_point",
 """Functions that return no tensor."""
 INTO = {"__getitem__", "__setitem__", "index_put", "index_put_"}
 """Functions that take indices of the CPU, too."""
+COPIES = {"tolist", "__repr__", "__format__"}
+"""Functions that copy a whole tensor to the host."""
+
+
+@dataclasses.dataclass
+class Traffic:
+    """How many nested functions run on the pretended device, and who is told of an "upload" or a "read"."""
+
+    running: int = 0
+    tell: Callable[[str], None] = lambda kind: None
+
+
+TRAFFIC = Traffic()
+
+
+class SerialPool:
+    """A pool of one thread, the caller's: the pretended device is known there alone."""
+
+    def __init__(self, *arguments: Any) -> None: ...
+    def __enter__(self) -> "SerialPool":
+        return self
+
+    def __exit__(self, *error: Any) -> None: ...
+    def map(self, function: Any, *values: Any) -> Any:
+        return map(function, *values)
+
+    def submit(self, function: Any, *values: Any) -> Future:
+        future: Future = Future()
+        future.set_result(function(*values))
+        return future
 
 
 def elsewhere(value: Tensor) -> Tensor:
@@ -83,29 +117,59 @@ class Elsewhere(Tensor):
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run a function of tensors as the device would."""
         kwargs, name = dict(kwargs or {}), getattr(func, "__name__", "")
+        if func == Tensor.device.__get__:
+            return DEVICE
+        if func == Tensor.is_cuda.__get__:
+            return True
         with torch._C.DisableTorchFunctionSubclass():
-            if func == Tensor.device.__get__:
-                return DEVICE
-            if func == Tensor.is_cuda.__get__:
-                return True
-            if name == "__get__" or name == "__set__":
-                return _moved(func(*args, **kwargs))
-            if name in DATA:
-                return func(*args, **kwargs)
-            if func in (Tensor.numpy, Tensor.__array__):
-                raise TypeError(f"can't convert {DEVICE} device type tensor to numpy")
             if func is Tensor.cpu:
+                TRAFFIC.tell("read")
                 return _plain(args[0]).clone()
             if func is Tensor.to:
                 return _to(args, kwargs)
-            if func is Tensor.__deepcopy__:
-                return elsewhere(args[0])
-            _refuse_mixes(func, name, args, kwargs)
-            result = func(
-                *(_home(_plain(x)) if not isinstance(x, list | tuple) else x for x in args), **_all_home(kwargs)
-            )
+            if func in (Tensor.numpy, Tensor.__array__):
+                raise TypeError(f"can't convert {DEVICE} device type tensor to numpy")
+            with _running():
+                if name == "__get__" or name == "__set__":
+                    return _moved(func(*args, **kwargs))
+                if name in COPIES:
+                    TRAFFIC.tell("read")
+                if name in DATA:
+                    return func(*args, **kwargs)
+                if func is Tensor.__deepcopy__:
+                    return elsewhere(args[0])
+                _refuse_mixes(func, name, args, kwargs)
+                _tell_uploads(name, args)
+                result = func(
+                    *(_home(_plain(x)) if not isinstance(x, list | tuple) else x for x in args), **_all_home(kwargs)
+                )
         stays = kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "cpu"
         return result if stays else _moved(result)
+
+
+@contextlib.contextmanager
+def _running() -> Iterator[None]:
+    """Count a function that runs on the pretended device."""
+    TRAFFIC.running += 1
+    try:
+        yield
+    finally:
+        TRAFFIC.running -= 1
+
+
+def _tell_uploads(name: str, args: Any) -> None:
+    """Tell of each argument of the CPU that the device copies: indices, a copied tensor, numbers of a new tensor."""
+    if name in INTO:
+        indices = args[1] if isinstance(args[1], tuple) else (args[1],)
+        uploads = sum(isinstance(x, list) or (isinstance(x, Tensor) and not isinstance(x, Elsewhere)) for x in indices)
+    elif name == "copy_":
+        if not isinstance(args[0], Elsewhere):
+            TRAFFIC.tell("read")
+        uploads = isinstance(args[0], Elsewhere) and not isinstance(args[1], Elsewhere)
+    else:
+        uploads = name == "new_tensor"
+    for _ in range(uploads):
+        TRAFFIC.tell("upload")
 
 
 def _all_home(kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -115,6 +179,15 @@ def _all_home(kwargs: dict[str, Any]) -> dict[str, Any]:
 def _to(args: Any, kwargs: dict[str, Any]) -> Tensor:
     """Run `Tensor.to`; a move between the devices copies."""
     target = _target([*args[1:], *kwargs.values()]) or _device(args[0])
+    if target.type != _device(args[0]).type:
+        TRAFFIC.tell("upload" if target.type == DEVICE.type else "read")
+        return _convert(target, args, kwargs)
+    with _running():
+        return _convert(target, args, kwargs)
+
+
+def _convert(target: torch.device, args: Any, kwargs: dict[str, Any]) -> Tensor:
+    """Return the tensor of `Tensor.to` on the device `target`."""
     rest = [_home(_plain(x)) for x in args[1:]]
     result = Tensor.to(_plain(args[0]), *rest, **{key: _home(_plain(value)) for key, value in kwargs.items()})
     if target.type != _device(args[0]).type:
@@ -153,7 +226,12 @@ class _Makers(TorchFunctionMode):
         if func in MAKERS and kwargs.get("device") is not None and torch.device(kwargs["device"]).type == DEVICE.type:
             if kwargs.get("generator") is not None:
                 raise RuntimeError(f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'")
-            return _moved(func(*args, **_all_home(kwargs)))
+            if func in (torch.tensor, torch.as_tensor):
+                if not isinstance(args[0], Elsewhere):
+                    TRAFFIC.tell("upload")
+                return _moved(func(*args, **_all_home(kwargs)))
+            with _running():
+                return _moved(func(*args, **_all_home(kwargs)))
         if func is Tensor.to and type(args[0]) is Tensor:
             target = _target([*args[1:], *kwargs.values()])
             if target is not None and target.type == DEVICE.type:
@@ -162,6 +240,8 @@ class _Makers(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
-def pretend() -> TorchFunctionMode:
-    """Return a context in which the pretended device is known."""
-    return _Makers()
+@contextlib.contextmanager
+def pretend() -> Iterator[None]:
+    """Open a context in which the pretended device is known."""
+    with mock.patch("torchgrasp.posture_model.sample.ThreadPoolExecutor", SerialPool), _Makers():
+        yield

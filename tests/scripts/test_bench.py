@@ -34,7 +34,7 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import solve_closure_lp, wrenches
 
-RUNS = ("hand/collision", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
+RUNS = ("gpu/launches", "hand/collision", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -43,7 +43,7 @@ def test_bench_writes_its_rows(name, tin, tmp_path):
     subject, short = name.split("/")
     options = Options(
         (short,), (tin,), hands=("barrett",), conditions=("none",),
-        starts=30, scale=2e-4, workers=0, out=tmp_path / "out",
+        starts=30, batches=(1,), scale=2e-4, workers=0, out=tmp_path / "out",
     )  # fmt: skip
     rows = measure(subject, options)
     assert len(rows) > 0

@@ -81,6 +81,8 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
     """Return all subsets of `size` numbers out of 0 to `count` - 1, one row per subset, in lexical order."""
+    if size == count:
+        return torch.arange(count, device=device)[None]
     return torch.tensor(list(itertools.combinations(range(count), size)), device=device)
 
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, pick, put
+from torchgrasp.base import Batch, named_tensors, pick, put
 
 SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
 
@@ -67,10 +67,9 @@ def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int
 
     Every problem takes at most `steps` steps, each with one evaluation. No gradient flows through the minimisation.
     """
-    whole, rows = state, torch.arange(len(state), device="cpu")
+    whole, rows = state, torch.arange(len(state), device=next(iter(named_tensors(state).values())).device)
     model = problem.linearise(state, rows)
-    costs = model.cost
-    rows, damping = rows.to(model.cost.device), torch.full_like(model.cost, problem.first_damping)
+    costs, damping = model.cost, torch.full_like(model.cost, problem.first_damping)
     for _ in range(steps):
         x, taken = problem.step(model, damping)
         left = torch.nonzero(taken)[:, 0]  # the only wait for the device in a step

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
+from torchgrasp.base import Value, kept
 from torchgrasp.checks import Range, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.mesh import closest_on_triangles
@@ -34,6 +34,13 @@ class SignedDistanceField(Value):
     spacing: float
     values: Float[Tensor, "x y z"]
 
+    @kept
+    def _cells(self) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
+        """The last node along each axis, and the steps from the first corner of a cell to all corners in `values`."""
+        shape, corner = self.values.shape, torch.arange(8, device=self.values.device)
+        last = torch.tensor(shape, device=corner.device) - 1
+        return last, (corner // 4 * shape[1] + corner // 2 % 2) * shape[2] + corner % 2
+
     @checked
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] of the grid node nearest to each point, outside the grid of a border node."""
@@ -51,13 +58,12 @@ class SignedDistanceField(Value):
         """
         _, ny, nz = self.values.shape
         position = (points - self.origin.to(points)) / self.spacing
-        last = torch.tensor([n - 1 for n in self.values.shape], device=points.device)
+        last, steps = self._cells
         inside = torch.minimum(position.clamp_min(0), last.to(points))
         cell = torch.minimum(inside.detach().long(), last - 1)
         fx, fy, fz = (inside - cell).unbind(-1)
         flat = (cell[..., 0] * ny + cell[..., 1]) * nz + cell[..., 2]
-        table, dx, dy = self.values.reshape(-1), ny * nz, nz
-        corner = [table[flat + i * dx + j * dy + k].to(points) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        corner = self.values.reshape(-1)[flat + steps.view(-1, *[1] * flat.ndim)].to(points)
         z = [torch.lerp(corner[2 * i], corner[2 * i + 1], fz) for i in range(4)]
         y = [torch.lerp(z[0], z[1], fy), torch.lerp(z[2], z[3], fy)]
         slope_z = [corner[2 * i + 1] - corner[2 * i] for i in range(4)]

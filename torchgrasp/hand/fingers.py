@@ -133,7 +133,7 @@ class Fingertips(Value):
         """Return the number f of fingertips."""
         return len(self.names)
 
-    @property
+    @kept
     def cone(self) -> Float[Tensor, "f"]:
         """The half angle [rad] of each pad's cone: the tip may touch only within this angle of the pad's axis."""
         angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)  # as when results were published

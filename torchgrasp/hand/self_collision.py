@@ -142,6 +142,11 @@ class SelfCollision(Value):
         return int(self.link.max()) + 1 if len(self.link) else 0
 
     @kept
+    def _ends(self) -> Int[Tensor, "2"]:
+        """The ends of the first and of the second kind of pair."""
+        return torch.tensor([self.kinds[0], self.kinds[0] + self.kinds[1]], device=self.pairs.device)
+
+    @kept
     def _bounding(self) -> Float[Tensor, " s"]:
         """The radius [m] of the bounding sphere of each collision shape."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
@@ -152,8 +157,7 @@ class SelfCollision(Value):
 
     def _split(self, pair: Int[Tensor, " k"]) -> Iterator[tuple[int, slice]]:
         """Yield each kind of pair, named by its number of spheres, with the slice of this kind among sorted pairs."""
-        first, second, _ = self.kinds
-        ends = torch.searchsorted(pair, torch.tensor([first, first + second], device=pair.device)).tolist()
+        ends = torch.searchsorted(pair, self._ends).tolist()
         for kind, (low, high) in enumerate(itertools.pairwise((0, *ends, len(pair)))):
             if high > low:
                 yield kind, slice(low, high)

@@ -36,10 +36,13 @@ def find_approach(
     chosen, clearance = candidates[:, 0].clone(), torch.full_like(coarse[:, 0], -math.inf)
     for choice in torch.argsort(coarse, dim=1, descending=True, stable=True).unbind(1):
         touching = torch.nonzero(clearance < 0)[:, 0]
+        if not len(touching):
+            break
         direction = candidates[touching, choice[touching]]
         exact = _clearance(centres[touching], radius, direction, world, exact=True)
         better = exact > clearance[touching]
-        chosen[touching[better]], clearance[touching[better]] = direction[better], exact[better]
+        chosen[touching] = torch.where(better[:, None], direction, chosen[touching])
+        clearance[touching] = torch.where(better, exact, clearance[touching])
     return chosen, clearance
 
 

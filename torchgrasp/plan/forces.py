@@ -118,7 +118,7 @@ def _search_forces(
     push = -(basis * normals[:, None]).sum(-1)
     slide = (basis + push[..., None] * normals[:, None]).reshape(-1, 3, 9).swapaxes(1, 2)
     push = push.swapaxes(1, 2)  # (b, 3, 3): normal force at each contact by each push
-    weights, found = _improve(push, slide, torch.zeros_like(push[:, 0]), _search_steps(), preferred)
+    weights, found = _improve(push, slide, torch.zeros_like(push[:, 0]), _search_steps(push.device), preferred)
     forces = (weights[:, None] @ basis.reshape(-1, 3, 9)).reshape(-1, 3, 3)
     return torch.where(found[:, None, None], forces, torch.nan)
 
@@ -132,7 +132,7 @@ def forces_near(points: Vectors, normals: Vectors, weights: Float[Tensor, "b p"]
     pairs = internal_forces(points)
     push = -(pairs * normals[:, None]).sum(-1)
     slide = (pairs + push[..., None] * normals[:, None]).flatten(2)
-    weights, found = _improve(push.mT, slide.mT, weights, _near_steps(weights.shape[1]), None)
+    weights, found = _improve(push.mT, slide.mT, weights, _near_steps(weights.shape[1], push.device), None)
     return torch.where(found[:, None, None], torch.einsum("bp,bpfi->bfi", weights, pairs), torch.nan)
 
 
@@ -144,7 +144,7 @@ def _improve(
     row = torch.arange(len(push), device=push.device)
     best, costs = row, weights
     for steps in rounds:
-        tried = weights[:, :, None] + steps.to(push.device)
+        tried = weights[:, :, None] + steps
         normal, across = push @ tried, slide @ tried
         ratio = ((across * across).unflatten(1, (-1, 3)).sum(2) / (normal * normal)).amax(1) ** 0.5
         least, most = normal.amin(1), normal.amax(1)
@@ -161,24 +161,24 @@ def _improve(
 
 
 @functools.cache
-def _search_steps() -> tuple[Float[Tensor, "3 s"], ...]:
+def _search_steps(device: torch.device) -> tuple[Float[Tensor, "3 s"], ...]:
     """Return for each round of a search the changes of the three normal forces that it tries, ever smaller."""
     with torch.device("cpu"):  # whatever the default device is
         first, near = (fibonacci_sphere(n, GOLDEN_ANGLE, 0.0) for n in (DIRECTIONS, NEIGHBOURS))
         around = torch.cat([near.new_zeros(1, 3), near]).T
     radii = 4 / math.sqrt(DIRECTIONS) * SHRINK ** np.arange(REFINEMENTS)
-    return first.T.contiguous(), *(radius * around for radius in radii.tolist())
+    return tuple(x.to(device) for x in (first.T.contiguous(), *(radius * around for radius in radii.tolist())))
 
 
 @functools.cache
-def _near_steps(pairs: int) -> tuple[Float[Tensor, "p s"], ...]:
+def _near_steps(pairs: int, device: torch.device) -> tuple[Float[Tensor, "p s"], ...]:
     """Return for each round of a short search the changes of the weights of all pairs that it tries."""
     count, radii = 24, (0.5, 0.28, 0.15)
     draw = torch.Generator("cpu").manual_seed(0)
     steps = unit(torch.randn(count, pairs, generator=draw, dtype=torch.float64, device="cpu"))
     steps = steps * torch.linspace(0.3, 1.0, count, dtype=torch.float64, device="cpu")[:, None]
     around = torch.cat([steps.new_zeros(1, pairs), steps]).T
-    return tuple(radius * around for radius in radii)
+    return tuple((radius * around).to(device) for radius in radii)
 
 
 def central_forces(points: Vectors, normals: Vectors, preferred: Float[Tensor, "b f"], slack: float) -> Vectors:

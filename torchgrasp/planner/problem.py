@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import settle
 from torchgrasp.checks import Seed, checked
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat
@@ -82,12 +81,12 @@ class Problem:
             shape = request.shape.moved(inverse(frame))
         scene = None if scene is None else scene.to_upright(frame)
         mixture = None if mixture is None else mixture.to(shape.device)
-        return cls(request, settle(hand, shape.device), cloud, spec, frame, shape, scene, mixture, mixture_sha256)
+        return cls(request, settle_hand(hand, shape.device), cloud, spec, frame, shape, scene, mixture, mixture_sha256)
 
     def for_hand(self, hand: Hand, observer: Observer) -> "Problem":
         """Return the problem for a hand with another set of fingers, and with another observer."""
         request = dataclasses.replace(self.request, observer=observer)
-        return self.replace("flat", "library", request=request, hand=settle(hand, self.shape.device))
+        return self.replace("flat", "library", request=request, hand=settle_hand(hand, self.shape.device))
 
     def replace(self, *dropped: str, **changes: Any) -> "Problem":
         """Return the problem with changed fields; it keeps all derived values except those `dropped`."""
@@ -199,6 +198,13 @@ class Problem:
         """Return a value of any type, converted from the upright frame to the caller's frame."""
         frame = self.obj_from_upright
         return value.moved(frame) if isinstance(value, ShapeGP) else move(value, frame)
+
+
+def settle_hand(hand: Hand, device: torch.device) -> Hand:
+    """Return the hand on a device; the hand caches a copy on another device, with the caches of the copy."""
+    if hand.lower.device != device and device not in hand.derived:
+        hand.derived[device] = hand.to(device)
+    return hand.derived.get(device, hand)
 
 
 @checked

@@ -163,8 +163,8 @@ def _extend(
     place, near = torch.argsort(points), int(has.sum())
     # Rows of the old and of the new observations after joining: distances of all points, then normals by component
     row = [
-        torch.cat([at] + [len(has) + c * near + at[mine] for c in range(3)])
-        for at, mine in ((place[:n], posterior.has_normal), (place[n:], new.has_normal))
+        torch.cat([at] + [len(has) + c * near + mine for c in range(3)])
+        for at, mine in ((x, x[own]) for x, own in ((place[:n], posterior.has_normal), (place[n:], new.has_normal)))
     ]
     order = torch.cat([posterior.ordered(row[0]), row[1] if new_order is None else row[1][new_order]])
     solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
