@@ -10,10 +10,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value
+from torchgrasp.checks import Count, Fraction, checked
 from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model.fit import fit_mixture
+from torchgrasp.posture_model.fit import MAX_REGULARISATION, fit_mixture, information_criterion, standardised_rows
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.posture_model.stepwise import growing_fits
 
 COMPARED_MODES = 4  # modes of which the nearest is compared: a code has a few postures at most
 
@@ -122,3 +124,43 @@ def bic_curve(
         observer(m, mixture)
     found = torch.tensor(criterion, dtype=torch.float64, device="cpu")
     return BicCurve(torch.tensor(list(components), device="cpu"), found)
+
+
+@checked
+def growing_bic(
+    samples: HandSamples,
+    most: Count = 64,
+    *,
+    iterations: Count = 100,
+    tolerance: Fraction = 1e-3,
+    observer: Callable[[int], object] = lambda m: None,
+) -> BicCurve:
+    """Return the BIC of 1 to `most` Gaussians (Fig. 6 b, d), each fit grown from the one before.
+
+    The heaviest Gaussian of a fit is split across its longest axis, and EM continues. A growing fit takes fewer steps
+    than a new one, and no random number. The criterion belongs to the given postures, for example a subset: more
+    postures support more Gaussians.
+
+    Args:
+        samples: joints [rad] and fingertip codes of postures of one hand.
+        most: largest number of Gaussians.
+        iterations: largest number of steps of each fit.
+        tolerance: stop a fit when a step raises the mean log-likelihood by less [nats].
+        observer: is called with each number of Gaussians after its fit.
+
+    Raises:
+        BadArgument: too few samples, a joint that does not vary, or a number out of range.
+        IndefiniteCovariance: a component collapsed more than three times.
+
+    >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
+    >>> growing_bic(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), most=3).components
+    tensor([1, 2, 3])
+    """
+    shard, _, scale = standardised_rows(samples, most)
+    criterion, n = [], len(samples)
+    for m, fit in enumerate(growing_fits(shard, most, iterations, tolerance, MAX_REGULARISATION), 1):
+        log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
+        criterion.append(information_criterion(fit.components, n, log_likelihood))
+        observer(m)
+    found = torch.tensor(criterion, dtype=torch.float64, device="cpu")
+    return BicCurve(torch.arange(1, most + 1, device="cpu"), found)
