@@ -114,7 +114,7 @@ def fit_mixture(
         starts: number of k-means initialisations, with consecutive seeds. After a few steps of each, the fit of the
             greatest likelihood continues.
         subset: least number of rows of nested random subsets, each half of the next. EM fits one after the other, and
-            all rows at last; of the starts, the likelier half goes on to the next subset. By default EM sees all rows.
+            all rows at last. Every start is fitted to the smaller subsets. By default, EM sees all rows in each step.
         checkpoint: file that stores the fit after every step. A fit that continues from it gives the same bits.
         distributed: whether `samples` are only the part of this process under torchrun. All processes must see the same
             checkpoint.
@@ -149,7 +149,8 @@ def fit_mixture(
         saved.save(progress)
         observer(progress)
 
-    fit = fit_subsets(subsets, start, iterations, tolerance, regularisation, observe)
+    sizes = [size for size in subsets.sizes if size >= start.rows]  # the smaller ones are done
+    fit = fit_subsets(subsets, sizes, start, iterations, tolerance, regularisation, observe)
     log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
     report = {
         "samples": str(n),

@@ -6,7 +6,7 @@ https://doi.org/10.1111/j.1467-9868.2009.00698.x) was tried, too: it found less 
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from jaxtyping import Int
@@ -27,7 +27,7 @@ from torchgrasp.posture_model.em import (
 class Subsets:
     """Nested random subsets of the rows of all processes; the processes do not change what a subset contains.
 
-    `sizes` are the numbers of rows: the last is the number of all rows, and every other about half of the next.
+    `sizes` are the numbers of rows. The last is the number of all rows, every other is half of the next.
     """
 
     shard: Shard
@@ -66,36 +66,33 @@ def halves(n: int) -> list[int]:
 
 def fit_subsets(
     subsets: Subsets,
+    sizes: Sequence[int],
     start: Progress,
     iterations: int,
     tolerance: float,
     regularisation: float,
     observer: Callable[[Progress], None] = lambda progress: None,
 ) -> Fit:
-    """Fit a mixture by EM to one subset after the other, from that of `start.rows` rows; arguments as for EM.
+    """Fit a mixture by EM to the subsets of these sizes in turn; the other arguments are those of EM.
 
-    `iterations` bounds the steps on all subsets together. The result, and its last log-likelihood, are of all rows.
+    `iterations` bounds the steps on all subsets together. The last log-likelihood is that of the last subset.
     """
-    sizes = [size for size in subsets.sizes if size >= start.rows]
     for size in sizes[:-1]:
-        start = _next(
-            expectation_maximisation(subsets.take(size), start, iterations, tolerance, regularisation, observer)
-        )
-    return expectation_maximisation(subsets.shard, start, iterations, tolerance, regularisation, observer)
+        part = subsets.take(size)
+        start = _next(expectation_maximisation(part, start, iterations, tolerance, regularisation, observer))
+    return expectation_maximisation(subsets.take(sizes[-1]), start, iterations, tolerance, regularisation, observer)
 
 
 def likeliest_fit(
     subsets: Subsets, starts: list[Progress], iterations: int, tolerance: float, regularisation: float
 ) -> Progress:
-    """Return the state of the likeliest fit. Each subset halves the number of fits; all rows leave one fit."""
-    for size in subsets.sizes:
-        if len(starts) > 1:
-            shard = subsets.take(size)
-            fits = [expectation_maximisation(shard, s, iterations, tolerance, regularisation) for s in starts]
-            fits.sort(key=lambda fit: float(fit.log_likelihood[-1]), reverse=True)
-            kept = 1 if size == subsets.sizes[-1] else (len(fits) + 1) // 2
-            starts = [_next(fit) for fit in fits[:kept]]
-    return starts[0]
+    """Fit each start to the smaller subsets; return the state of the likeliest fit."""
+    enough = 8  # times the first subset: on fewer rows, the likeliest fit is often not the likeliest on all rows
+    sizes = [size for size in subsets.sizes[:-1] if size <= enough * subsets.sizes[0]] or subsets.sizes
+    if len(starts) == 1:
+        return starts[0]
+    fits = [fit_subsets(subsets, sizes, start, iterations, tolerance, regularisation) for start in starts]
+    return _next(max(fits, key=lambda fit: float(fit.log_likelihood[-1])))
 
 
 def growing_fits(shard: Shard, most: int, iterations: int, tolerance: float, regularisation: float) -> Iterator[Fit]:
