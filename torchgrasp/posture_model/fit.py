@@ -42,9 +42,8 @@ class Checkpoint:
             return
         tensors = {**vars(progress.components), "centre": self.centre, "scale": self.scale}
         tensors |= {"reseeded": progress.reseeded, "log_likelihood": progress.log_likelihood}
-        save_tensors(
-            self.path, "em", tensors, {**self.settings, "jumped": str(progress.jumped), "step_rows": str(progress.rows)}
-        )
+        meta = {**self.settings, "jumped": str(progress.jumped), "step_rows": str(progress.rows)}
+        save_tensors(self.path, "em", tensors, meta)
 
     def load(self) -> Progress | None:
         """Return the saved state, or None without a file; raises `ModelFileError`, or `BadArgument` for another fit."""
@@ -79,8 +78,8 @@ class Checkpoint:
         if (step_rows := meta.get("step_rows", "")) not in sizes:
             raise ModelFileError("checkpoint", f"{path}: a step on {step_rows!r} rows", f"one of {list(sizes)}")
         components = Components(tensors["weights"], tensors["means"], tensors["covariances"])
-        jumped = meta.get("jumped") == "True"
-        progress = Progress(components, tensors["reseeded"], tensors["log_likelihood"], jumped, sizes[step_rows])
+        state = tensors["reseeded"], tensors["log_likelihood"], meta.get("jumped") == "True", sizes[step_rows]
+        progress = Progress(components, *state)
         return progress.to(self.centre.device)
 
 
@@ -129,9 +128,9 @@ def fit_mixture(
     >>> fit_mixture(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), components=2).joint_names
     ('knuckle',)
     """
-    if subset is not None and subset < components * _least(samples):
-        raise BadArgument("subset", subset, f"at least {components * _least(samples)}")
     shard, centre, scale = standardised_rows(samples, components, distributed)
+    if subset is not None and subset < (least := components * (len(scale) + 2)):
+        raise BadArgument("subset", subset, f"at least {least}")
     n, subsets = shard.count(), Subsets.of(shard, subset, seed)
     fixed = {"rows": n, "components": components, "seed": seed, "starts": starts, "regularisation": regularisation}
     settings = {name: str(value) for name, value in (fixed | {"subset": subset}).items()}
@@ -178,23 +177,15 @@ def information_criterion(components: Components, n: int, log_likelihood: float)
 def standardised_rows(
     samples: HandSamples, components: int, distributed: bool = False
 ) -> tuple[Shard, Float[Tensor, "d"], Float[Tensor, "d"]]:
-    """Return the rows with mean 0 and variance 1, and the original means and standard deviations.
-
-    Raises `BadArgument` for samples that cannot support so many components.
-    """
+    """Return rows of mean 0 and variance 1, and the original means and deviations; refuse too few samples."""
     if samples.q.shape[1] != len(CODE_NAMES):
         raise BadArgument("samples", f"codes of {samples.q.shape[1]} numbers", "codes of three fingertips: six numbers")
     shard = Shard.of(samples.rows().double(), distributed)  # a copy, which is standardised in place
-    n, least = shard.count(), _least(samples)
+    n, least = shard.count(), shard.rows.shape[1] + 2  # fewer samples leave the covariance of d dimensions singular
     if n < least:
         raise BadArgument("samples", f"{n} samples", f"at least {least}")
     check_whole("components", components, 1, n // least)
     return shard, *_standardise(shard, (*samples.joint_names, *CODE_NAMES))
-
-
-def _least(samples: HandSamples) -> int:
-    """Return the least number of samples of a component: fewer leave the covariance of d dimensions singular."""
-    return samples.joints.shape[1] + samples.q.shape[1] + 2
 
 
 def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchgrasp.base import Value
 from torchgrasp.checks import Count, checked
 from torchgrasp.errors import BadArgument
+from torchgrasp.posture_model.em import start_components
 from torchgrasp.posture_model.fit import MAX_REGULARISATION, information_criterion, standardised_rows
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
@@ -112,8 +113,8 @@ def growing_bic(samples: HandSamples, most: Count = 64, observer: Callable[[int]
     tensor([1, 2, 3])
     """
     shard, _, scale = standardised_rows(samples, most)
-    criterion = []
-    for m, fit in enumerate(growing_fits(shard, most, 100, 1e-3, MAX_REGULARISATION), 1):
+    start, criterion = start_components(shard, 1, 0, MAX_REGULARISATION), []
+    for m, fit in zip(range(1, most + 1), growing_fits(shard, start, 100, 1e-3, MAX_REGULARISATION), strict=False):
         log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
         criterion.append(information_criterion(fit.components, len(samples), log_likelihood))
         observer(m)

@@ -12,15 +12,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchgrasp.posture_model.em import (
-    Fit,
-    Progress,
-    Shard,
-    expectation,
-    expectation_maximisation,
-    maximisation,
-    start_components,
-)
+from torchgrasp.posture_model.em import Fit, Progress, Shard, expectation, expectation_maximisation, maximisation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,12 +33,9 @@ class Subsets:
         sizes = tuple(size for size in halves(n)[::-1] if smallest is not None and size >= smallest) or (n,)
         if len(sizes) == 1:
             return Subsets(shard, sizes)
-        lengths = shard.lengths()
-        order = torch.randperm(n, generator=torch.Generator().manual_seed(seed), device="cpu")
-        first = int(lengths[: shard.rank].sum())
-        place = torch.empty_like(order)
-        place[order] = torch.arange(n, device="cpu")
-        return Subsets(shard, sizes, place[first : first + len(shard.rows)].to(shard.rows.device))
+        place = torch.randperm(n, generator=torch.Generator().manual_seed(seed), device="cpu")
+        here = place.split(shard.lengths().tolist())[shard.rank]
+        return Subsets(shard, sizes, here.to(shard.rows.device))
 
     def take(self, size: int) -> Shard:
         """Return the rows of this process in the subset of so many rows."""
@@ -56,11 +45,7 @@ class Subsets:
 
 
 def halves(n: int) -> list[int]:
-    """Return n, n / 2, n / 4 and so on, rounded down, to 1.
-
-    >>> halves(10)
-    [10, 5, 2, 1]
-    """
+    """Return n, n / 2, n / 4 and so on, rounded down, to 1."""
     return [n >> k for k in range(n.bit_length())]
 
 
@@ -95,14 +80,12 @@ def likeliest_fit(
     return _next(max(fits, key=lambda fit: float(fit.log_likelihood[-1])))
 
 
-def growing_fits(shard: Shard, most: int, iterations: int, tolerance: float, regularisation: float) -> Iterator[Fit]:
-    """Yield the fits of 1, 2, ... `most` components; each starts from the one before, its heaviest component split."""
-    start = start_components(shard, 1, 0, regularisation)
+def growing_fits(
+    shard: Shard, start: Progress, iterations: int, tolerance: float, regularisation: float
+) -> Iterator[Fit]:
+    """Yield fits without end, each of one component more; each starts from the last, its heaviest component split."""
     while True:
-        fit = expectation_maximisation(shard, start, iterations, tolerance, regularisation)
-        yield fit
-        if len(fit.components.weights) == most:
-            return
+        yield (fit := expectation_maximisation(shard, start, iterations, tolerance, regularisation))
         sums, _ = expectation(shard, fit.components)
         sums = torch.cat([sums, torch.zeros_like(sums[:1])])  # a component without rows takes half of the heaviest
         components, split = maximisation(sums, shard.count(), regularisation, fit.reseeded.new_zeros(len(sums)))
