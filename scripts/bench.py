@@ -2,8 +2,8 @@
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
 close  misplaced, sensors, perturb, table-lift, holding, speed, success: closing and lifting in simulation
-gpu    kernels, launches: every kernel of the chain on a GPU beside the CPU; launches and waits, counted without a GPU
-hand   fk, collision, codes: kinematics beside pytorch-kinematics, self-collision and inverse kinematics
+gpu    kernels, clouds, launches: kernels on a GPU beside the CPU; many clouds at once; launches, counted without a GPU
+hand   fk, collision, codes, em: kinematics beside pytorch-kinematics, self-collision, inverse kinematics, learning
 load   plans, trials, points, starts: memory over many plans and trials, and of large inputs
 plan   truth, fields, executable, certificates: the contact planner on the true surface and in exact arithmetic
 scene  plane, click, rooms, real, whole, clutter, clear: depth images, and lifts among neighbours

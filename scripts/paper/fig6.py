@@ -7,11 +7,12 @@ import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from paper.bic import bic_curve
 from paper.cross_validation import CrossValidation, cross_validate
 from torchgrasp import load_hand
 from torchgrasp.files import write_file
 from torchgrasp.posture_model.sample import sample_configurations
-from torchgrasp.posture_model.score import BicCurve, bic_curve
+from torchgrasp.posture_model.score import BicCurve
 
 PUBLISHED = {"allegro": 41, "barrett": 36}
 """The paper's numbers of Gaussians."""

@@ -65,6 +65,7 @@ def test_the_checkpoint_of_another_fit_a_damaged_one_and_bad_folders_are_refused
         (samples, {"components": 5, "seed": 1}),
         (samples, {"components": 5, "starts": 2}),
         (samples, {"components": 5, "regularisation": 1e-7}),
+        (samples, {"components": 5, "subset": 500}),
         (samples[:-1], {"components": 5}),
         (moved, {"components": 5}),
     ]:
@@ -92,6 +93,8 @@ share = ring()[:1100] if rank == 0 else ring()[1100:]  # unequal shares
 path = {str(tmp_path)!r}
 mixture = fit_mixture(share, 5, seed=3, iterations=25, tolerance=0.0, distributed=True, checkpoint=path + "/fit")
 mixture.save(path + f"/{{rank}}.safetensors")
+parts = fit_mixture(share, 5, seed=3, iterations=60, distributed=True, subset=400, starts=2)
+parts.save(path + f"/parts{{rank}}.safetensors")
 torch.distributed.destroy_process_group()
 """)
     done = run_python("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script))
@@ -101,6 +104,8 @@ torch.distributed.destroy_process_group()
     one = fit_mixture(ring(), 5, seed=3, iterations=25, tolerance=0.0)
     torch.testing.assert_close(parameters(first), parameters(one), rtol=1e-9, atol=1e-12)
     assert first.meta == one.meta
+    parts, one = load_mixture(tmp_path / "parts1.safetensors"), fit_mixture(ring(), 5, 3, 60, subset=400, starts=2)
+    torch.testing.assert_close(parameters(parts), parameters(one), rtol=1e-7, atol=1e-10)
     # One process goes on where two stood.
     longer = fit_mixture(ring(), 5, seed=3, iterations=30, tolerance=0.0, checkpoint=tmp_path / "fit")
     assert longer.meta["iterations"] == "30"

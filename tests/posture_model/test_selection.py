@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from paper.bic import bic_curve
 from paper.cross_validation import cross_validate
 
 from torchgrasp import fit_mixture
 from torchgrasp.errors import BadArgument
 from torchgrasp.posture_model import DEFAULT_ENERGY, PAPER_ENERGY, HandSamples
-from torchgrasp.posture_model.score import bic_curve, evaluate_mixture
+from torchgrasp.posture_model.score import evaluate_mixture, growing_bic
 
 
 def islands(n: int = 1500, m: int = 4) -> HandSamples:
@@ -33,6 +34,20 @@ def test_bic_is_that_of_the_fit_and_finds_the_number_of_true_components():
     log_likelihood = float(fit_mixture(samples, 2, seed=3).log_prob(samples.rows()).sum())
     parameters = 1 + 2 * (8 + 8 * 9 // 2)  # one weight, two means and covariances
     assert math.isclose(float(curve.bic[0]), -2 * log_likelihood + parameters * math.log(len(samples)), abs_tol=0.1)
+
+
+def test_growing_fits_find_the_number_of_true_components_and_are_as_likely_as_new_fits():
+    samples, seen = islands(), []
+    curve = growing_bic(samples, 6, observer=seen.append)
+    assert seen == curve.components.tolist() == [1, 2, 3, 4, 5, 6]
+    assert int(curve.components[curve.bic.argmin()]) == 4
+    apart = bic_curve(samples, range(1, 7)).bic
+    torch.testing.assert_close(curve.bic[:1], apart[:1], rtol=0, atol=0.1)  # one Gaussian has one fit
+    torch.testing.assert_close(curve.bic[3:4], apart[3:4], rtol=0, atol=2.0)  # the true number has one good fit
+    assert bool((curve.bic <= apart * 1.02).all())
+    assert torch.equal(growing_bic(samples, 2).bic, curve.bic[:2])  # the fits use no random number
+    with pytest.raises(BadArgument, match=r"components: expected .*got 200"):
+        growing_bic(samples, 200)
 
 
 def test_a_killed_sweep_goes_on(tmp_path):

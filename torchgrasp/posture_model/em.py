@@ -52,6 +52,12 @@ class Shard:
         """Return the number of samples (rows) in all processes together."""
         return int(self.sum(self.rows.new_tensor(len(self.rows), dtype=torch.int64)))
 
+    def lengths(self) -> Int[Tensor, "p"]:
+        """Return the number of rows in each process."""
+        lengths = self.rows.new_zeros(self.processes, dtype=torch.int64)
+        lengths[self.rank] = len(self.rows)
+        return self.sum(lengths)
+
 
 @dataclasses.dataclass(frozen=True)
 class Components(Value):
@@ -71,7 +77,8 @@ class Progress(Value):
     """The state of a fit. The state and the data determine the next step.
 
     `reseeded` counts how often each component collapsed and was placed anew; the likelihood may fall after that.
-    `log_likelihood` [nats] is the mean over the data before each step. `jumped`: the last step placed a component anew.
+    `log_likelihood` [nats] is the mean over the data before each step. `jumped`: the last step placed a component anew,
+    or the next step sees other rows. `rows` is the number of rows that the last step saw, or 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
     >>> Progress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
@@ -82,6 +89,7 @@ class Progress(Value):
     reseeded: Int[Tensor, "m"]
     log_likelihood: Float[Tensor, "t"]
     jumped: bool = False
+    rows: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,9 +118,9 @@ def expectation_maximisation(
         history = torch.cat([state.log_likelihood, (log_likelihood / n)[None]])
         converged = len(history) > 1 and not state.jumped and float(history[-1] - history[-2]) < tolerance
         if converged or len(history) > iterations:
-            return Fit(state.components, state.reseeded, history, state.jumped, converged)
+            return Fit(state.components, state.reseeded, history, state.jumped, n, converged)
         components, reseeded = maximisation(sums, n, regularisation, state.reseeded)
-        state = Progress(components, reseeded, history, reseeded is not state.reseeded)
+        state = Progress(components, reseeded, history, reseeded is not state.reseeded, n)
         observer(state)
 
 
@@ -120,7 +128,7 @@ def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m 
     """Return for each component the features summed with its responsibilities, and the log-likelihood of all data."""
     x, coefficients = shard.rows, coefficients_from_components(components)
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
-    at_once = min(CACHED_ROWS if x.device.type == "cpu" else 2**17, len(x))  # smaller passes leave a GPU idle
+    at_once = min(CACHED_ROWS if x.device.type == "cpu" else 2**17, len(x) or 1)  # smaller passes leave a GPU idle
     features, joint = x.new_empty(coefficients.shape[1], at_once), x.new_empty(len(coefficients), at_once)  # reused
     floor = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; denormal numbers are slow
     for rows in x.split(at_once):
@@ -219,9 +227,7 @@ def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> 
 
 def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]:
     """Return random data rows, drawn from all processes; every process gets the same rows."""
-    x, lengths = shard.rows, shard.rows.new_zeros(shard.processes, dtype=torch.int64)
-    lengths[shard.rank] = len(x)
-    lengths = shard.sum(lengths)
+    x, lengths = shard.rows, shard.lengths()
     order = torch.randperm(int(lengths.sum()), generator=generator, device="cpu")  # for any number of processes
     pick = order[:20_000].to(x.device) - lengths[: shard.rank].sum()  # some hundred for each component
     here = (pick >= 0) & (pick < len(x))

@@ -17,6 +17,7 @@ from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.posture_model.em import Components, Progress, Shard, expectation_maximisation, start_components
 from torchgrasp.posture_model.mixture import CODE_NAMES, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.posture_model.stepwise import Subsets, fit_subsets, halves, likeliest_fit
 
 MAX_REGULARISATION = 1e-6  # largest variance added to a dimension, relative to the data's
 TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes some hundred
@@ -41,7 +42,8 @@ class Checkpoint:
             return
         tensors = {**vars(progress.components), "centre": self.centre, "scale": self.scale}
         tensors |= {"reseeded": progress.reseeded, "log_likelihood": progress.log_likelihood}
-        save_tensors(self.path, "em", tensors, {**self.settings, "jumped": str(progress.jumped)})
+        meta = {**self.settings, "jumped": str(progress.jumped), "step_rows": str(progress.rows)}
+        save_tensors(self.path, "em", tensors, meta)
 
     def load(self) -> Progress | None:
         """Return the saved state, or None without a file; raises `ModelFileError`, or `BadArgument` for another fit."""
@@ -72,8 +74,12 @@ class Checkpoint:
             t, dtype = tensors[name], torch.int64 if name == "reseeded" else torch.float64
             if (shape != (-1,) and t.shape != shape) or t.dtype != dtype:
                 raise ModelFileError("checkpoint", f"{path}: {name} {tuple(t.shape)} {t.dtype}", str(shape))
+        sizes = {str(size): size for size in halves(int(self.settings["rows"]))}
+        if (step_rows := meta.get("step_rows", "")) not in sizes:
+            raise ModelFileError("checkpoint", f"{path}: a step on {step_rows!r} rows", f"one of {list(sizes)}")
         components = Components(tensors["weights"], tensors["means"], tensors["covariances"])
-        progress = Progress(components, tensors["reseeded"], tensors["log_likelihood"], meta.get("jumped") == "True")
+        state = tensors["reseeded"], tensors["log_likelihood"], meta.get("jumped") == "True", sizes[step_rows]
+        progress = Progress(components, *state)
         return progress.to(self.centre.device)
 
 
@@ -87,6 +93,7 @@ def fit_mixture(
     regularisation: Annotated[float, Range(0.0, MAX_REGULARISATION)] = MAX_REGULARISATION,
     *,
     starts: Annotated[int, Range(1, 1000)] = 1,
+    subset: Count | None = None,
     checkpoint: Path | str | None = None,
     distributed: bool = False,
     observer: Callable[[Progress], None] = lambda progress: None,
@@ -105,6 +112,8 @@ def fit_mixture(
         regularisation: variance added to every dimension of a component, relative to its variance over all samples.
         starts: number of k-means initialisations, with consecutive seeds. After a few steps of each, the fit of the
             greatest likelihood continues.
+        subset: least number of rows of nested random subsets, each half of the next. EM fits one after the other, and
+            all rows at last. Every start is fitted to the smaller subsets. By default, EM sees all rows in each step.
         checkpoint: file that stores the fit after every step. A fit that continues from it gives the same bits.
         distributed: whether `samples` are only the part of this process under torchrun. All processes must see the same
             checkpoint.
@@ -119,33 +128,29 @@ def fit_mixture(
     >>> fit_mixture(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), components=2).joint_names
     ('knuckle',)
     """
-    if samples.q.shape[1] != len(CODE_NAMES):
-        raise BadArgument("samples", f"codes of {samples.q.shape[1]} numbers", "codes of three fingertips: six numbers")
-    rows = samples.rows().double()  # a copy, which is standardised in place
-    shard = Shard.of(rows, distributed)
-    n, least = shard.count(), rows.shape[1] + 2  # fewer samples leave the covariance of d dimensions singular
-    if n < least:
-        raise BadArgument("samples", f"{n} samples", f"at least {least}")
-    check_whole("components", components, 1, n // least)
-    names = (*samples.joint_names, *CODE_NAMES)
-    centre, scale = _standardise(shard, names)
-
+    shard, centre, scale = standardised_rows(samples, components, distributed)
+    if subset is not None and subset < (least := components * (len(scale) + 2)):
+        raise BadArgument("subset", subset, f"at least {least}")
+    n, subsets = shard.count(), Subsets.of(shard, subset, seed)
     fixed = {"rows": n, "components": components, "seed": seed, "starts": starts, "regularisation": regularisation}
-    settings = {name: str(value) for name, value in fixed.items()}
+    settings = {name: str(value) for name, value in (fixed | {"subset": subset}).items()}
     saved = Checkpoint(None if checkpoint is None else Path(checkpoint), shard, centre, scale, settings)
     start = saved.load()
     if start is None:
-        begun = [start_components(shard, components, seed + k, regularisation) for k in range(starts)]
-        start = _likeliest(shard, begun, regularisation)
+        first = subsets.take(subsets.sizes[0])
+        begun = [start_components(first, components, seed + k, regularisation) for k in range(starts)]
+        if subset is None:
+            start = _likeliest(shard, begun, regularisation)
+        else:
+            start = likeliest_fit(subsets, begun, iterations, tolerance, regularisation)
 
     def observe(progress: Progress) -> None:
         saved.save(progress)
         observer(progress)
 
-    fit = expectation_maximisation(shard, start, iterations, tolerance, regularisation, observe)
+    sizes = [size for size in subsets.sizes if size >= start.rows]  # the smaller ones are done
+    fit = fit_subsets(subsets, sizes, start, iterations, tolerance, regularisation, observe)
     log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
-    m, d = fit.components.means.shape
-    parameters = (m - 1) + m * d + m * d * (d + 1) // 2  # of weights, means and full covariances
     report = {
         "samples": str(n),
         "fit_seed": str(seed),
@@ -154,10 +159,33 @@ def fit_mixture(
         "converged": str(fit.converged).lower(),
         "reseeded": str(int(fit.reseeded.sum())),
         "log_likelihood": f"{log_likelihood:.6f}",
-        "bic": f"{-2 * n * log_likelihood + parameters * math.log(n):.1f}",
+        "bic": f"{information_criterion(fit.components, n, log_likelihood):.1f}",
     }
+    report |= {} if subset is None else {"fit_subset": str(subset)}
+    names = (*samples.joint_names, *CODE_NAMES)
     means, covariances = fit.components.means * scale + centre, fit.components.covariances * scale[:, None] * scale
     return GraspMixture(fit.components.weights, means, covariances, names, regularisation, samples.meta | report)
+
+
+def information_criterion(components: Components, n: int, log_likelihood: float) -> float:
+    """Return the BIC of a fit to n samples with this mean log-likelihood [nats]; smaller is better."""
+    m, d = components.means.shape
+    parameters = (m - 1) + m * d + m * d * (d + 1) // 2  # of weights, means and full covariances
+    return -2 * n * log_likelihood + parameters * math.log(n)
+
+
+def standardised_rows(
+    samples: HandSamples, components: int, distributed: bool = False
+) -> tuple[Shard, Float[Tensor, "d"], Float[Tensor, "d"]]:
+    """Return rows of mean 0 and variance 1, and the original means and deviations; refuse too few samples."""
+    if samples.q.shape[1] != len(CODE_NAMES):
+        raise BadArgument("samples", f"codes of {samples.q.shape[1]} numbers", "codes of three fingertips: six numbers")
+    shard = Shard.of(samples.rows().double(), distributed)  # a copy, which is standardised in place
+    n, least = shard.count(), shard.rows.shape[1] + 2  # fewer samples leave the covariance of d dimensions singular
+    if n < least:
+        raise BadArgument("samples", f"{n} samples", f"at least {least}")
+    check_whole("components", components, 1, n // least)
+    return shard, *_standardise(shard, (*samples.joint_names, *CODE_NAMES))
 
 
 def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
