@@ -19,13 +19,13 @@ from torchgrasp.planner.batches import Planner, rank_together
 from torchgrasp.planner.changes import Change, list_changes, more_starts
 from torchgrasp.planner.grasps import expected_success
 from torchgrasp.planner.problem import Problem
-from torchgrasp.planner.request import Observer, Request, ignore
+from torchgrasp.planner.request import Observer, Request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds, PointCloud
 
-MOST_TRIALS = 6  # most changes that are tried
+MOST_TRIALS = 8  # most changes that are tried
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,15 +179,18 @@ def explain_empty(
     """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
 
     The changes are: other fingers, another shipped hand, wider limits of contacts, higher friction, no table, no
-    neighbours, an arm that reaches everything. Grasps are planned for each with the same seed and at most 100 initial
-    guesses. At most eight changes are tried, in the order of the losses that they could prevent. The search ends at a
-    change that the user can choose and whose 20 best grasps are likely to succeed. If no change helps, more initial
-    guesses are tried.
+    neighbours, an arm that reaches everything. The search ends at a change that the user can choose and with which the
+    best fifth of the guesses is likely to succeed.
+
+    The work is bounded, not the time, so that a seed always gives the same explanation. A plan has at most 20 initial
+    guesses and a small library of postures. Relaxed constraints are tried only where no contact set is found. At most
+    eight changes are tried, in the order of the losses that they could prevent; fewer with "auto" fingers. If no change
+    helps, a request of at most 80 guesses is tried with four times as many.
 
     Args:
         cloud, hand, spec, starts, seed: as in `plan_grasps`.
-        options: the further arguments of `plan_grasps`. The `observer` is called with "change" and the `Trial` of each
-            change.
+        options: the further arguments of `plan_grasps`. The `observer` is called with "funnel" and the `Funnel` of the
+            first plan, then with "change" and the `Trial` of each change. No change begins after `time_budget`.
 
     Returns:
         The explanation; `print` shows it.
@@ -201,12 +204,12 @@ def explain_empty(
     >>> explanation.best.words
     'if the friction were 0.4 instead of 0'
     """
-    starts_tried = 24  # starts with which a change is tried: one change takes about a second
+    starts_tried = 20  # starts with which a change is tried: one change takes about a second
     request = Request(cloud, hand, spec, starts, seed, **options)
     deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
     few = dataclasses.replace(request, starts=min(starts, starts_tried))
-    funnel, _, problem = try_request(few, observer=request.observer)
-    trials, left, plans = list[Trial](), 0, MOST_TRIALS + 1 - len(few.hands)
+    funnel, _, problem = try_request(few, first=request.observer)
+    trials, left, plans = list[Trial](), 0, MOST_TRIALS - 2 * (len(few.hands) - 1)  # each set needs a library
 
     def try_change(change: Change) -> None:
         found, expected, _ = try_request(change.request, None if change.refit else problem)
@@ -218,7 +221,7 @@ def explain_empty(
         if any(choice or not change.choice for choice in solved):
             continue
         plans -= len(change.request.hands)
-        if plans >= 0 and time.monotonic() < deadline:
+        if (plans >= 0 or not trials) and time.monotonic() < deadline:
             try_change(change)
         else:
             left += 1
@@ -253,15 +256,15 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
 
 
 def try_request(
-    request: Request, known: Problem | None = None, observer: Observer = ignore
+    request: Request, known: Problem | None = None, first: Observer | None = None
 ) -> tuple[Funnel, float, Problem]:
     """Plan a request with a small library of postures; return the losses, the expected success, and the problem.
 
     The object of a `known` problem is used again. Several sets of fingers share the initial guesses. If no contact set
-    is found, the most relaxed constraints are tried, too; on a new object also if no grasp is found. The success is
-    that of the best fifth of the guesses. The `observer` is called with "funnel" and the losses of the first plan.
+    is found, the most relaxed constraints are tried, too. The success is that of the best fifth of the guesses. An
+    observer `first` hears "funnel" and the losses of the first plan.
     """
-    postures = 500  # a fifth of a second for hands that often collide with themselves
+    postures = 500  # more take seconds to draw for a hand that often collides with itself
     told, hands, found = dict[str, Any](), request.hands, list[tuple[Funnel, float]]()
     note = lambda stage, _, value: told.update({stage: value})  # noqa: E731
     share = dataclasses.replace(request, starts=max(request.starts // len(hands), 1), observer=note)
@@ -270,15 +273,14 @@ def try_request(
     def plan(problem: Problem) -> Funnel:
         grasps = rank_together(list(Planner(problem).run(math.inf)), request.order)
         funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
-        if not found:
-            observer("funnel", str(funnel.worst), funnel)
+        if first is not None and not found:
+            first("funnel", str(funnel.worst), funnel)
         found.append((funnel, expected_success(grasps, max(share.starts // 5, 1))))
         return funnel
 
     for hand in hands:
         problem = problem.for_request(share, hand, postures)
-        strict = plan(problem)
-        if not strict.executable and (known is None or not strict.stages[0].kept):
+        if not plan(problem).stages[0].kept:
             relaxed = problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max()))
             for spec in list(relaxed)[-1:]:
                 plan(problem.replace("flat", given_spec=spec, descends=True))
