@@ -4,6 +4,7 @@ Every change is tried by planning with it.
 """
 
 import dataclasses
+import itertools
 import math
 import time
 from typing import Any
@@ -19,7 +20,7 @@ from torchgrasp.planner.batches import Planner, rank_together
 from torchgrasp.planner.changes import Change, list_changes, more_starts
 from torchgrasp.planner.grasps import expected_success
 from torchgrasp.planner.problem import Problem
-from torchgrasp.planner.request import Observer, Request
+from torchgrasp.planner.request import Observer, Request, ignore
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
@@ -210,26 +211,18 @@ def explain_empty(
     few = dataclasses.replace(request, starts=min(starts, starts_tried))
     funnel, _, problem = try_request(few, first=request.observer)
     trials, left, plans = list[Trial](), 0, MOST_TRIALS - 2 * (len(few.hands) - 1)  # each set needs a library
-
-    def try_change(change: Change) -> None:
+    more = more_starts(request)
+    for change in [] if funnel.executable else [*order_changes(list_changes(few), funnel), more]:
+        if any(x.executable if change is more else x.expected >= 0.8 and x.choice >= change.choice for x in trials):
+            continue  # little is left for this change
+        plans -= len(change.request.hands)
+        allowed = starts <= 4 * starts_tried if change is more else plans >= 0 or not trials
+        if not allowed or time.monotonic() >= deadline:
+            left += 1
+            continue
         found, expected, _ = try_request(change.request, None if change.refit else problem)
         trials.append(Trial(change.words, change.choice, found.executable, expected, found))
         request.observer("change", str(trials[-1]), trials[-1])
-
-    for change in [] if funnel.executable else order_changes(list_changes(few), funnel):
-        solved = [trial.choice for trial in trials if trial.expected >= 0.8]  # little is left for other changes
-        if any(choice or not change.choice for choice in solved):
-            continue
-        plans -= len(change.request.hands)
-        if (plans >= 0 or not trials) and time.monotonic() < deadline:
-            try_change(change)
-        else:
-            left += 1
-    if not funnel.executable and not any(trial.executable for trial in trials):
-        if starts <= 4 * starts_tried and time.monotonic() < deadline:
-            try_change(more_starts(request))
-        else:
-            left += 1
     trials.sort(
         key=lambda trial: (-round(trial.expected, 1), -bool(trial.executable), not trial.choice, -trial.expected)
     )
@@ -256,7 +249,7 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
 
 
 def try_request(
-    request: Request, known: Problem | None = None, first: Observer | None = None
+    request: Request, known: Problem | None = None, first: Observer = ignore
 ) -> tuple[Funnel, float, Problem]:
     """Plan a request with a small library of postures; return the losses, the expected success, and the problem.
 
@@ -266,22 +259,19 @@ def try_request(
     """
     postures = 500  # more take seconds to draw for a hand that often collides with itself
     told, hands, found = dict[str, Any](), request.hands, list[tuple[Funnel, float]]()
-    note = lambda stage, _, value: told.update({stage: value})  # noqa: E731
-    share = dataclasses.replace(request, starts=max(request.starts // len(hands), 1), observer=note)
-    problem = Problem.of(share, hands[0]) if known is None else known
-
-    def plan(problem: Problem) -> Funnel:
-        grasps = rank_together(list(Planner(problem).run(math.inf)), request.order)
-        funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
-        if first is not None and not found:
-            first("funnel", str(funnel.worst), funnel)
-        found.append((funnel, expected_success(grasps, max(share.starts // 5, 1))))
-        return funnel
-
+    starts = max(request.starts // len(hands), 1)
+    share = dataclasses.replace(request, starts=starts, observer=lambda stage, _, value: told.update({stage: value}))
+    problem = known or Problem.of(share, hands[0])
     for hand in hands:
         problem = problem.for_request(share, hand, postures)
-        if not plan(problem).stages[0].kept:
-            relaxed = problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max()))
-            for spec in list(relaxed)[-1:]:
-                plan(problem.replace("flat", given_spec=spec, descends=True))
+        specs = list(problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max())))[-1:]
+        relaxed = (problem.replace("flat", given_spec=spec, descends=True) for spec in specs)
+        for tried in itertools.chain((problem,), relaxed):
+            grasps = rank_together(list(Planner(tried).run(math.inf)), request.order)
+            funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
+            if not found:
+                first("funnel", str(funnel.worst), funnel)
+            found.append((funnel, expected_success(grasps, max(starts // 5, 1))))
+            if funnel.stages[0].kept:
+                break
     return *max(found, key=lambda pair: (pair[1], pair[0].executable)), problem

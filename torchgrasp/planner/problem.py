@@ -93,9 +93,8 @@ class Problem:
     def for_request(self, request: Request, hand: Hand, postures: int) -> "Problem":
         """Return the problem of another request on the same object and table, with a small library of `postures`."""
         spec = dataclasses.replace(request.contact_spec, table=self.given_spec.table)
-        changes = {"request": request, "hand": settle(hand, self.shape.device), "postures": postures}
-        dropped = ("flat", "library", "obstacles", "world", "buried", "reachable")
-        return self.replace(*dropped, given_spec=spec, **changes)
+        new = {"request": request, "hand": settle(hand, self.shape.device), "given_spec": spec, "postures": postures}
+        return self.replace("flat", "library", "obstacles", "world", "buried", "reachable", **new)
 
     def replace(self, *dropped: str, **changes: Any) -> "Problem":
         """Return the problem with changed fields; it keeps all derived values except those `dropped`."""
