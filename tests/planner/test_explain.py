@@ -6,9 +6,11 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import load_hand, see
+from tests.make import ball, load_hand, see
 from torchgrasp import ContactSpec, PointCloud, Status, explain_empty, load_object
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.ik.seeds import PostureLibrary
+from torchgrasp.planner.batches import Planner
 from torchgrasp.planner.changes import list_changes
 from torchgrasp.planner.explain import Funnel, Losses, order_changes
 from torchgrasp.planner.request import Request
@@ -138,7 +140,8 @@ def test_a_disc_too_low_needs_its_table_gone_and_an_object_under_another_the_oth
     disc, heard = view_of(trimesh.creation.cylinder(radius=0.03, height=0.005)), []
     note = lambda *stage: heard.append(stage)  # noqa: E731
     explanation = explain_empty(disc, load_hand("allegro"), TABLE, starts=8, observer=note)
-    assert heard == [("change", str(explanation.best), explanation.best)]
+    told = ("funnel", str(explanation.funnel.worst), explanation.funnel)
+    assert heard == [told, ("change", str(explanation.best), explanation.best)]
     assert Status.BELOW_TABLE in explanation.funnel.stages[0].lost
     assert explanation.best is not None and "no table" in explanation.best.words and not explanation.best.choice
     scene = see((0.0, 0.0, 0.09, 0.06), (0.0, 0.0, 0.07, 0.05, 0.06)).select(1)
@@ -161,7 +164,7 @@ def made_up(monkeypatch):
     tried = []
 
     def install(world):
-        def plan(task: Request):
+        def plan(task: Request, *_, **__):
             count, expected = world(task)
             tried.append(task)
             lost = {} if count else {Status.TIP_ERROR: 5}
@@ -188,15 +191,45 @@ def test_the_best_change_wins_a_choice_that_solves_it_ends_the_search_and_grasps
     assert explanation.trials[0].executable == 20 and len(explanation.trials) < 5
     made_up(lambda t: (7, 0.3))
     explanation = explain_empty(VIEW, load_hand("barrett"), TABLE)
-    assert explanation.trials == () and "7 of 100 starts" in explanation.advice
+    assert explanation.trials == () and "7 of 20 starts" in explanation.advice
 
 
 def test_more_starts_are_tried_where_nothing_helps_and_then_it_says_so(made_up):
     tried = made_up(lambda t: (0, 0.0))
-    explanation = explain_empty(VIEW, load_hand("barrett"), TABLE, starts=300)
-    assert explanation.best is None and tried[-1].starts == 1200 and {t.starts for t in tried[:-1]} == {100}
+    explanation = explain_empty(VIEW, load_hand("barrett"), TABLE, starts=80)
+    assert explanation.best is None and tried[-1].starts == 320 and {t.starts for t in tried[:-1]} == {20}
     assert explanation.advice.startswith("No single change helps")
     assert Status.TIP_ERROR.sentence in explanation.advice
-    made_up(lambda t: (4, 0.2) if t.starts > 1000 else (0, 0.0))
-    explanation = explain_empty(VIEW, load_hand("barrett"), TABLE, starts=300)
-    assert explanation.best is not None and explanation.best.words == "with 1200 starts"
+    made_up(lambda t: (4, 0.2) if t.starts > 300 else (0, 0.0))
+    explanation = explain_empty(VIEW, load_hand("barrett"), TABLE, starts=80)
+    assert explanation.best is not None and explanation.best.words == "with 320 starts"
+
+
+@pytest.mark.parametrize("fingers", [None, "auto"])
+def test_the_work_is_bounded_and_what_the_bound_left_out_is_counted(made_up, fingers):
+    tried = made_up(lambda t: (0, 0.0))
+    hand = load_hand("allegro")
+    explanation = explain_empty(VIEW, hand, TABLE, fingers=fingers)
+    funnel = Funnel((Losses("contacts", "starts", 5, {Status.NOT_CLOSED: 2}), explanation.funnel.stages[1]))
+    listed = order_changes(list_changes(Request(VIEW, hand, TABLE, 20, 0, fingers=fingers)), funnel)
+    assert sum(len(t.hands) for t in tried) <= 9 and {t.starts for t in tried} == {20}
+    assert len(tried) - 1 == len(explanation.trials) > 0 and explanation.left > 0
+    assert len(explanation.trials) + explanation.left == len(listed) + 1  # four times 1000 starts are left out, too
+    assert f"({len(explanation.trials)} of {len(listed) + 1} changes tried)" in explanation.advice
+    explanation = explain_empty(VIEW, hand, TABLE, fingers=fingers, time_budget=1e-3)
+    assert len(explanation.trials) <= 1
+
+
+def test_a_thing_that_no_hand_holds_is_explained_with_few_plans_and_twice_alike(monkeypatch):
+    monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 1)
+    plans, heard, run = [], [], Planner.run
+    monkeypatch.setattr(Planner, "run", lambda self, *given: plans.append(self.problem) or run(self, *given))
+    cloud, hand = ball(radius=0.2, centre=(0.0, 0.0, 0.2)), load_hand("barrett")
+    own = PostureLibrary.of(hand)
+    note = lambda stage, text, _: heard.append((stage, text, len(plans)))  # noqa: E731
+    first, again = (explain_empty(cloud, hand, TABLE, starts=100, observer=note) for _ in range(2))
+    assert str(first) == str(again) and first.best is None and "no single change helps" in str(first).lower()
+    assert heard[0][0] == "funnel" and heard[0][2] == 1  # the first answer needs one plan alone
+    assert len(plans) <= 2 * 2 * 2 and len(heard) == len(first.trials) + len(again.trials) + 2
+    assert all(p.request.starts <= 20 and len(p.library.joints) <= 500 for p in plans)
+    assert PostureLibrary.of(hand) is own  # the next plan need not draw it anew

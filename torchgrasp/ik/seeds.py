@@ -63,11 +63,11 @@ class PostureLibrary(Value):
     @classmethod
     @checked
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
-        """Draw random postures within the joint limits and without self-collision; the hand caches the last library."""
+        """Draw random postures within limits and without self-collision; the hand caches the last library of a size."""
         count = (5000 if len(hand.tips) == 3 else 20_000) if count is None else count
-        found = hand.derived.get(PostureLibrary)
-        if found is None or found[0] != (count, seed):
-            found = hand.derived[PostureLibrary] = (count, seed), cls._drawn(hand, count, seed)
+        found = hand.derived.get((PostureLibrary, count))
+        if found is None or found[0] != seed:
+            found = hand.derived[PostureLibrary, count] = seed, cls._drawn(hand, count, seed)
         return found[1]
 
     @classmethod

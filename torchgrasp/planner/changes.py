@@ -123,7 +123,7 @@ def _surroundings(request: Request) -> Iterator[Change]:
             yield Change(words, True, crowded - {Status.BURIED}, _with(request, contact_allowed=True))
         table = cloud.table if spec.table is None else spec.table
         alone = dataclasses.replace(_with(request, table=table), cloud=take_target(cloud, request.seed))
-        yield Change("if its neighbours were taken away first", False, crowded, alone)
+        yield Change("if its neighbours were taken away first", False, crowded, alone, refit=True)
     elif spec.table is not None:
         words = "if no table were in the way, as on a narrow stand"
         yield Change(words, False, AT_TABLE | {Status.TIP_ERROR}, _with(request, table=None), refit=True)

@@ -4,6 +4,9 @@ Every change is tried by planning with it.
 """
 
 import dataclasses
+import itertools
+import math
+import time
 from typing import Any
 
 from jaxtyping import Int
@@ -13,11 +16,12 @@ from torchgrasp.base import Value, count_status
 from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
+from torchgrasp.planner.batches import Planner, rank_together
 from torchgrasp.planner.changes import Change, list_changes, more_starts
-from torchgrasp.planner.grasps import expected_success, plan_grasps
-from torchgrasp.planner.request import Request
+from torchgrasp.planner.grasps import expected_success
+from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.request import Observer, Request, ignore
 from torchgrasp.scene.scene import Scene
-from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds, PointCloud
@@ -124,8 +128,8 @@ class Trial(Value):
 class Explanation(Value):
     """Why there is no grasp: where grasps were lost, and the results of single changes, the most helpful first.
 
-    For each change, grasps were planned from `starts` initial guesses. `str` gives one line for each stage, and a
-    sentence about the best change.
+    For each change, grasps were planned from `starts` initial guesses. `left` is the number of changes that the bound
+    on work left out. `str` gives one line for each stage, and a sentence about the best change.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
     >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
@@ -137,6 +141,7 @@ class Explanation(Value):
     starts: int
     funnel: Funnel
     trials: tuple[Trial, ...]
+    left: int = 0
 
     @property
     def best(self) -> Trial | None:
@@ -148,7 +153,8 @@ class Explanation(Value):
         """A sentence about the best change and the user's best choice; if no change helps, about the worst stage."""
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
-        tried = f"{len(self.trials)} change{'s' * (len(self.trials) != 1)} tried"
+        listed = len(self.trials) + self.left
+        tried = f"{len(self.trials)} of " * bool(self.left) + f"{listed} change{'s' * (listed != 1)} tried"
         helpful = [trial for trial in self.trials if trial.executable]
         if not helpful:
             lost = f"most {self.funnel.worst.things} are lost because {self.funnel.reason.sentence}"
@@ -174,15 +180,18 @@ def explain_empty(
     """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
 
     The changes are: other fingers, another shipped hand, wider limits of contacts, higher friction, no table, no
-    neighbours, an arm that reaches everything. Grasps are planned for each with the same seed and at most 100 initial
-    guesses. At most eight changes are tried, in the order of the losses that they could prevent. The search ends at a
-    change that the user can choose and whose 20 best grasps are likely to succeed. If no change helps, more initial
-    guesses are tried.
+    neighbours, an arm that reaches everything. The search ends at a change that the user can choose and with which the
+    best fifth of the guesses is likely to succeed.
+
+    The work is bounded, not the time, so that a seed always gives the same explanation. A plan has at most 20 initial
+    guesses and a small library of postures. Relaxed constraints are tried only where no contact set is found. At most
+    eight changes are tried, in the order of the losses that they could prevent; fewer with "auto" fingers. If no change
+    helps, a request of at most 80 guesses is tried with four times as many.
 
     Args:
         cloud, hand, spec, starts, seed: as in `plan_grasps`.
-        options: the further arguments of `plan_grasps`. The `observer` is called with "change" and the `Trial` of each
-            change.
+        options: the further arguments of `plan_grasps`. The `observer` is called with "funnel" and the `Funnel` of the
+            first plan, then with "change" and the `Trial` of each change. No change begins after `time_budget`.
 
     Returns:
         The explanation; `print` shows it.
@@ -196,29 +205,28 @@ def explain_empty(
     >>> explanation.best.words
     'if the friction were 0.4 instead of 0'
     """
-    starts_tried = 100  # starts with which a change is tried
+    starts_tried = 20  # starts with which a change is tried: one change takes about a second
     request = Request(cloud, hand, spec, starts, seed, **options)
+    deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
     few = dataclasses.replace(request, starts=min(starts, starts_tried))
-    funnel, _, shape = try_request(few)
-    trials = list[Trial]()
-
-    def try_change(change: Change) -> None:
-        known = shape if request.shape is None and not change.refit else request.shape
-        found, expected, _ = try_request(dataclasses.replace(change.request, shape=known))
+    funnel, _, problem = try_request(few, first=request.observer)
+    trials, left, plans = list[Trial](), 0, MOST_TRIALS - 2 * (len(few.hands) - 1)  # each set needs a library
+    more = more_starts(request)
+    for change in [] if funnel.executable else [*order_changes(list_changes(few), funnel), more]:
+        if any(x.executable if change is more else x.expected >= 0.8 and x.choice >= change.choice for x in trials):
+            continue  # little is left for this change
+        plans -= len(change.request.hands)
+        allowed = starts <= 4 * starts_tried if change is more else plans >= 0 or not trials
+        if not allowed or time.monotonic() >= deadline:
+            left += 1
+            continue
+        found, expected, _ = try_request(change.request, None if change.refit else problem)
         trials.append(Trial(change.words, change.choice, found.executable, expected, found))
         request.observer("change", str(trials[-1]), trials[-1])
-
-    changes = [] if funnel.executable else order_changes(list_changes(few), funnel)[:MOST_TRIALS]
-    for change in changes:
-        solved = [trial.choice for trial in trials if trial.expected >= 0.8]  # little is left for other changes
-        if not any(choice or not change.choice for choice in solved):
-            try_change(change)
-    if not funnel.executable and not any(trial.executable for trial in trials):
-        try_change(more_starts(request))
     trials.sort(
         key=lambda trial: (-round(trial.expected, 1), -bool(trial.executable), not trial.choice, -trial.expected)
     )
-    return Explanation(few.starts, funnel, tuple(trials))
+    return Explanation(few.starts, funnel, tuple(trials), left)
 
 
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
@@ -240,9 +248,30 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
     return [changes[k] for k in sorted(weight, key=lambda k: -weight[k]) if 0 < weight[k] >= least]
 
 
-def try_request(request: Request) -> tuple[Funnel, float, ShapeGP]:
-    """Plan a request; return how many grasps each stage lost, the expected success and the estimated shape."""
-    told = dict[str, Any]()
-    request = dataclasses.replace(request, observer=lambda stage, message, value: told.update({stage: value}))
-    grasps = plan_grasps(**vars(request))
-    return Funnel.of(told["plan"], told["certify"], told["query"], grasps), expected_success(grasps), told["shape"]
+def try_request(
+    request: Request, known: Problem | None = None, first: Observer = ignore
+) -> tuple[Funnel, float, Problem]:
+    """Plan a request with a small library of postures; return the losses, the expected success, and the problem.
+
+    The object of a `known` problem is used again. Several sets of fingers share the initial guesses. If no contact set
+    is found, the most relaxed constraints are tried, too. The success is that of the best fifth of the guesses. An
+    observer `first` hears "funnel" and the losses of the first plan.
+    """
+    postures = 500  # more take seconds to draw for a hand that often collides with itself
+    told, hands, found = dict[str, Any](), request.hands, list[tuple[Funnel, float]]()
+    starts = max(request.starts // len(hands), 1)
+    share = dataclasses.replace(request, starts=starts, observer=lambda stage, _, value: told.update({stage: value}))
+    problem = known or Problem.of(share, hands[0])
+    for hand in hands:
+        problem = problem.for_request(share, hand, postures)
+        specs = list(problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max())))[-1:]
+        relaxed = (problem.replace("flat", given_spec=spec, descends=True) for spec in specs)
+        for tried in itertools.chain((problem,), relaxed):
+            grasps = rank_together(list(Planner(tried).run(math.inf)), request.order)
+            funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
+            if not found:
+                first("funnel", str(funnel.worst), funnel)
+            found.append((funnel, expected_success(grasps, max(starts // 5, 1))))
+            if funnel.stages[0].kept:
+                break
+    return *max(found, key=lambda pair: (pair[1], pair[0].executable)), problem

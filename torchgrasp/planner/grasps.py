@@ -211,10 +211,10 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
     return best[1]
 
 
-def expected_success(grasps: Grasps) -> float:
-    """Return the mean predicted success of the `BEST` best executable grasps; 0 for each grasp that is missing."""
+def expected_success(grasps: Grasps, best: int = BEST) -> float:
+    """Return the mean predicted success of the `best` best executable grasps; 0 for each grasp that is missing."""
     likely = torch.where(grasps.status == Status.OK, torch.sigmoid(grasps.score), 0.0)
-    return float(likely.sort(descending=True).values[:BEST].sum()) / BEST
+    return float(likely.sort(descending=True).values[:best].sum()) / best
 
 
 def _plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:

@@ -44,7 +44,7 @@ class Problem:
 
     The upright frame has the table's normal as z axis. `request`, the object's `cloud` and `given_spec` are in the
     caller's frame, all other fields in the upright frame. Derived values are computed when first used.
-    `descends` allows hands that go down while they close.
+    `descends` allows hands that go down while they close. `postures` is the number of random postures in `library`.
     """
 
     request: Request
@@ -57,6 +57,7 @@ class Problem:
     mixture: GraspMixture | None
     mixture_sha256: str
     descends: bool = False
+    postures: int | None = None
 
     @classmethod
     def of(cls, request: Request, hand: Hand) -> "Problem":
@@ -87,6 +88,12 @@ class Problem:
         """Return the problem for a hand with another set of fingers, and with another observer."""
         request = dataclasses.replace(self.request, observer=observer)
         return self.replace("flat", "library", request=request, hand=settle_hand(hand, self.shape.device))
+
+    def for_request(self, request: Request, hand: Hand, postures: int) -> "Problem":
+        """Return the problem of another request on the same object and table, with a small library of `postures`."""
+        spec = dataclasses.replace(request.contact_spec, table=self.given_spec.table)
+        new = {"request": request, "hand": settle(hand, self.shape.device), "given_spec": spec, "postures": postures}
+        return self.replace("flat", "library", "obstacles", "world", "buried", "reachable", **new)
 
     def replace(self, *dropped: str, **changes: Any) -> "Problem":
         """Return the problem with changed fields; it keeps all derived values except those `dropped`."""
@@ -145,7 +152,7 @@ class Problem:
     @cached_property
     def library(self) -> PostureLibrary:
         """Random postures of the hand, from which initial postures near contacts are chosen."""
-        return PostureLibrary.of(self.hand, seed=self.request.seed)
+        return PostureLibrary.of(self.hand, self.postures, self.request.seed)
 
     @cached_property
     def buried(self) -> bool:
