@@ -17,11 +17,10 @@ from torchgrasp.files import sha256
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, round_upright, upright_frame
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.candidates import GraspProblem, Reachable
+from torchgrasp.ik.candidates import Reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
-from torchgrasp.ik.seeds import PostureLibrary
-from torchgrasp.plan.starts import Settled, settle_flatness
+from torchgrasp.plan.starts import Settled, check_starts, settle_flatness
 from torchgrasp.planner.request import Observer, Request, ignore
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
@@ -33,7 +32,7 @@ from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
 from torchgrasp.specs import ContactSpec
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.promise import describe_promise
-from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud
+from torchgrasp.values import Grasps, PointCloud
 
 TARGET_POINTS = 1000  # most points of a scene's target that are used: they lie a few millimetres apart
 
@@ -44,7 +43,7 @@ class Problem:
 
     The upright frame has the table's normal as z axis. `request`, the object's `cloud` and `given_spec` are in the
     caller's frame, all other fields in the upright frame. Derived values are computed when first used.
-    `descends` allows hands that go down while they close. `postures` is the number of random postures in `library`.
+    `descends` allows hands that go down while they close. `postures` is the size of the posture library.
     """
 
     request: Request
@@ -84,16 +83,27 @@ class Problem:
         mixture = None if mixture is None else mixture.to(shape.device)
         return cls(request, settle_hand(hand, shape.device), cloud, spec, frame, shape, scene, mixture, mixture_sha256)
 
+    def prepared(self) -> "Problem":
+        """Return this problem after the values that stages need were computed; raise `BadArgument` as they do."""
+        check_starts(self.shape, self.given_spec, self.request.starts)
+        _ = self.flat, self.body, self.vague
+        return self
+
     def for_hand(self, hand: Hand, observer: Observer) -> "Problem":
         """Return the problem for a hand with another set of fingers, and with another observer."""
         request = dataclasses.replace(self.request, observer=observer)
-        return self.replace("flat", "library", request=request, hand=settle_hand(hand, self.shape.device))
+        return self.replace("flat", request=request, hand=settle_hand(hand, self.shape.device))
 
     def for_request(self, request: Request, hand: Hand, postures: int) -> "Problem":
         """Return the problem of another request on the same object and table, with a small library of `postures`."""
         spec = dataclasses.replace(request.contact_spec, table=self.given_spec.table)
-        new = {"request": request, "hand": settle(hand, self.shape.device), "given_spec": spec, "postures": postures}
-        return self.replace("flat", "library", "obstacles", "world", "buried", "reachable", **new)
+        new = {
+            "request": request,
+            "hand": settle_hand(hand, self.shape.device),
+            "given_spec": spec,
+            "postures": postures,
+        }
+        return self.replace("flat", "obstacles", "world", "buried", "reachable", **new)
 
     def replace(self, *dropped: str, **changes: Any) -> "Problem":
         """Return the problem with changed fields; it keeps all derived values except those `dropped`."""
@@ -122,7 +132,7 @@ class Problem:
     @cached_property
     def body(self) -> EstimatedBody:
         """The estimated body, with its distance field."""
-        return EstimatedBody(self.shape, self.surface.vertices, collision_field(self.shape, self.surface))
+        return EstimatedBody.around(self.shape, self.surface.vertices, collision_field(self.shape, self.surface))
 
     @property
     def center(self) -> Float[Tensor, "3"]:
@@ -150,11 +160,6 @@ class Problem:
         return CollisionWorld(self.body.field, self.spec.plane, self.obstacles)
 
     @cached_property
-    def library(self) -> PostureLibrary:
-        """Random postures of the hand, from which initial postures near contacts are chosen."""
-        return PostureLibrary.of(self.hand, self.postures, self.request.seed)
-
-    @cached_property
     def buried(self) -> bool:
         """Whether obstacles prevent lifting: the rising object would enter them over 3 mm deeper than at rest."""
         if self.obstacles is None or not self.obstacles.hard:
@@ -167,10 +172,6 @@ class Problem:
         """The user's function that says which hand poses an arm reaches, converted to the upright frame."""
         given, frame = self.request.reachable, self.obj_from_upright
         return None if given is None else lambda poses: given(frame.to(poses) @ poses)
-
-    def reach(self, contacts: Contacts, certificate: Certificate) -> GraspProblem:
-        """Return the inverse kinematics problem of reaching contacts, with their certificate of force closure."""
-        return GraspProblem(self.hand, contacts, certificate, self.world, self.center, self.reachable, self.descends)
 
     def tell(self, stage: str, message: str, value: Any) -> None:
         """Report a stage to the observer, with the result of the stage in the caller's frame."""
