@@ -175,6 +175,21 @@ def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
+def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
+    """Return a number, or one value for each row, with axes added so that it applies to all of `like` of its row.
+
+    A value of each row has `own` axes itself.
+    """
+    if not isinstance(value, Tensor) or not value.ndim:
+        return value
+    return value.reshape(len(value), *[1] * (like.ndim - 1 - own), *value.shape[1:])
+
+
+def at_once(x: Tensor, size: int) -> int:
+    """Return how many rows of `x` to work on at once: `size` on a CPU, whose cache then holds all temporaries."""
+    return size if x.device.type == "cpu" else 64 * size  # fewer leave an accelerator idle, more fill its memory
+
+
 def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
     """Evaluate a function on chunks of `size` rows of x, which bounds the memory; return the joined outputs."""
     if len(x) <= size:

@@ -50,7 +50,7 @@ class Options:
         laws: controllers of close/misplaced; by default all.
         grasps: grasps of each view, the best or spread over all ranks.
         starts: random starts of the contact planner.
-        batches: numbers of clouds of gpu/launches.
+        batches: numbers of clouds of gpu/clouds and gpu/launches.
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
         draws: trials of each grasp of close/table-lift, with other displacements, pushes and noise.
         tries: largest number of grasps that a trial of close/table-lift tries; by default as the protocol says.
@@ -72,7 +72,7 @@ class Options:
     laws: tuple[str, ...] = ()
     grasps: int = 1
     starts: int = 1000
-    batches: tuple[int, ...] = (1, 16, 256)
+    batches: tuple[int, ...] = (1, 4, 16)
     scale: float = 1.0
     draws: int = 5
     tries: int | None = None

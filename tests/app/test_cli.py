@@ -210,7 +210,7 @@ def test_an_empty_result_names_what_would_help(tmp_path, run_command):
     assert any(line.startswith("change") and "executable" in line for line in out.splitlines())
     last = out.splitlines()[-1]
     assert last.startswith("The barrett hand has no executable grasp")
-    assert "if the friction were 0.8 instead of 0" in last
+    assert "if the friction were 0.4 instead of 0" in last
 
 
 @pytest.mark.parametrize("words", [["cloud"], ["cloud", "--help"], ["shape", "-h"], ["cloud", "check", "--help"]])

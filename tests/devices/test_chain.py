@@ -11,6 +11,7 @@ from tests.devices.conftest import same, sent
 from tests.devices.elsewhere import DEVICE
 from tests.make import cup_view, see
 from tests.pinch import QUICK, cylinder, pinch
+from tests.planner.test_many import share_found
 from torchgrasp import (
     ContactSpec,
     GraspTask,
@@ -83,10 +84,20 @@ def test_grasps_of_every_kind_are_where_the_cloud_is(device, hand, name):
     same(PLANS[name](sent(VIEW), hand), PLANS[name](VIEW, hand))
 
 
+def test_clouds_planned_together_have_the_grasps_of_each_alone(device, hand):
+    clouds, task = [VIEW, PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint), cup_view(0.004)], GraspTask(0.1)
+    alone = plan_grasps(clouds, hand, SPEC, 12, task=task)
+    together = plan_grasps(sent(clouds), hand, SPEC, 12, task=task)
+    assert "refused" in together[1].meta and all(grasps.joints.device == DEVICE for grasps in together)
+    for there, here in zip(together[::2], alone[::2], strict=True):
+        assert there.meta == here.meta and share_found(here, here.to(DEVICE).to("cpu")) == 1.0
+        assert share_found(here, there.to("cpu")) > 0.9  # rounding may move a few
+
+
 def test_a_worker_plans_where_its_cloud_is(device, hand, monkeypatch):
     """The workers are played by this process, which alone knows the pretended device."""
     serial = lambda function, tasks, workers, limit: [function(*task) for task in tasks]  # noqa: E731
-    monkeypatch.setattr("torchgrasp.planner.grasps.run_tasks", serial)
+    monkeypatch.setattr("torchgrasp.planner.many.run_tasks", serial)
     expected = plan_grasps([VIEW], hand, SPEC, 2)
     same(plan_grasps([sent(VIEW)], hand, SPEC, 2, workers=1), expected)
     refused = plan_grasps([sent(PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint))], hand, SPEC, 2)[0]

@@ -70,7 +70,7 @@ SHAPES = {
     "extract_surface": lambda shape, x: extract_surface(shape, 24),
     "plan_contacts": lambda shape, x: plan_contacts(shape, SPEC, 6),
     "plan_contacts, paper": lambda shape, x: plan_contacts(shape, ContactSpec.paper(), 2),
-    "plan_contacts, given starts": lambda shape, x: plan_contacts(shape, SPEC, x[:12].reshape(4, 3, 3)),
+    "plan_contacts, given starts": lambda shape, x: plan_contacts(shape, SPEC, x[:12].reshape(4, 3, 3)).contacts,
 }
 CONTACTS = {
     "certify": lambda contacts, shape: certify(contacts, SPEC),

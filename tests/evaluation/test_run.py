@@ -146,7 +146,7 @@ def test_grasps_of_an_earlier_call_keep_the_reason_why_there_are_none(folder, tm
 def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(folder, tmp_path, monkeypatch):
     """Here most fingers always win, which are others than the hand's own; later trials find them by the files."""
     pytest.importorskip("sapien")
-    monkeypatch.setattr("torchgrasp.planner.grasps.expected_success", lambda grasps: grasps.contacts.points.shape[1])
+    monkeypatch.setattr("torchgrasp.planner.run.expected_success", lambda grasps: grasps.contacts.points.shape[1])
     test = PROTOCOLS["dexgraspbench"]
     test = dataclasses.replace(test, pull=dataclasses.replace(test.pull, seconds=0.1))
     spec = EvaluationSpec(1, starts=8, only=("tin",), fingers="auto")

@@ -6,7 +6,8 @@ import trimesh
 
 from tests.make import field_of_mesh, real
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.geometry.field_batch import FieldBatch
+from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
 from torchgrasp.hand.self_collision import box_distance
 
 
@@ -81,3 +82,22 @@ def test_bad_surfaces_are_named():
         field_from_surface(vertices, torch.tensor([[0, 1, 2]]), spacing=0.0)
     with pytest.raises(BadArgument, match="nodes"):
         field_from_surface(vertices, torch.tensor([[0, 1, 2]]), spacing=0.001)
+
+
+def test_every_row_of_joined_fields_has_the_distances_of_its_own_field(generator):
+    shapes, fields = ((9, 7, 8), (5, 12, 6), (8, 8, 8)), list[SignedDistanceField]()
+    for k, shape in enumerate(shapes):
+        low, values = (
+            torch.rand(3, generator=generator).double() - 0.6,
+            torch.randn(shape, generator=generator).double(),
+        )
+        fields.append(SignedDistanceField(low, 0.05 + 0.01 * k, values))
+    owner = torch.randint(3, (50,), generator=generator)
+    points = torch.randn(50, 4, 3, generator=generator, dtype=torch.float64)  # some outside the grids
+    joined = FieldBatch.of(fields).rows(owner)
+    for ask in (lambda field, x: field.query(x), lambda field, x: [field.nearest_node(x)]):
+        found = ask(joined, points)
+        for k, field in enumerate(fields):
+            for value, expected in zip(found, ask(field, points[owner == k]), strict=True):
+                torch.testing.assert_close(value[owner == k], expected)
+    assert set(joined.spacing[owner == 2].tolist()) == {fields[2].spacing}

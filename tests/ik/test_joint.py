@@ -12,7 +12,7 @@ from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.joint import JointProblem, JointState, solve_joint
 from torchgrasp.ik.seeds import nearest_postures
 from torchgrasp.plan.feasibility import flatness_constraint
-from torchgrasp.plan.problem import triple_jet
+from torchgrasp.plan.problem import ContactProblem, triple_jet
 from torchgrasp.plan.solver import normalise_tensions
 
 
@@ -43,8 +43,8 @@ def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generat
     f, pairs = spec.fingertips, spec.fingertips * (spec.fingertips - 1) // 2
     tension = normalise_tensions(points, torch.rand(24, pairs, generator=generator, dtype=torch.float64))
     strict = dataclasses.replace(spec, max_variance=0.01)  # so that some points are too uncertain
-    problem = JointProblem(hand, shape, strict, given.world)
-    flat = flatness_constraint(shape, points, 0.2, spec.ring_radius)
+    problem = JointProblem.of(given, shape, ContactProblem.of(shape, strict))
+    flat = flatness_constraint(shape, points, 0.2, spec.ring_radius / shape.scale)
 
     def rows(state: JointState):
         residual, jacobian = problem.residuals(state, flat)
@@ -75,7 +75,8 @@ def test_hands_that_cannot_reach_are_given_up_and_the_others_named(scene):
     pose[far, 0, 3] += 5.0  # steps are short: no hand comes back from there
     start = Configuration(seeds.joints, pose)
     points = shape.normalise(assign(given.contacts, seeds).points)
-    configuration, _, rows = JointProblem(given.hand, shape, spec, given.world).solve(start, points)
+    problem = JointProblem.of(given, shape, ContactProblem.of(shape, spec))
+    configuration, _, rows = problem.solve(start, points)
     assert len(rows) > 0 and not bool(far[rows].any()) and len(configuration) == len(rows)
     moved = torch.linalg.vector_norm(configuration.obj_from_hand[:, :3, 3] - pose[rows, :3, 3], dim=-1)
     assert float(moved.max()) < 0.2

@@ -28,12 +28,14 @@ def on_surface(ellipsoid, generator, count: int, fingertips: int) -> Tensor:
 def test_variation_on_a_sphere_is_the_angle_of_the_ring_and_values_change_sign_there(ellipsoid, generator):
     sphere = dataclasses.replace(ellipsoid, axes=(0.5, 0.5, 0.5))
     points = 0.5 * unit(torch.randn(5, 3, 3, generator=generator, dtype=torch.float64))
-    found = normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS)
+    found = normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS / sphere.scale)
     expected = math.atan(RING_RADIUS / (0.5 * sphere.scale))
     torch.testing.assert_close(found, torch.full_like(found, expected))
-    angle = float(normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS).mean())
+    angle = float(
+        normal_variation(sphere, points, triple_jet(sphere, points).normals, RING_RADIUS / sphere.scale).mean()
+    )
     for limit, sign in ((0.99 * angle / INSIDE, 1), (1.01 * angle / INSIDE, -1)):
-        value = flatness_constraint(sphere, points, limit, RING_RADIUS).value
+        value = flatness_constraint(sphere, points, limit, RING_RADIUS / sphere.scale).value
         assert value.shape == (5, 3 * GUIDING_POINTS)
         assert bool((sign * value > 0).all())
 
@@ -41,7 +43,9 @@ def test_variation_on_a_sphere_is_the_angle_of_the_ring_and_values_change_sign_t
 def test_variation_is_infinite_but_among_the_contacts_asked_for(ellipsoid, generator):
     points = on_surface(ellipsoid, generator, 20, 3)
     normals, among = triple_jet(ellipsoid, points).normals, torch.rand(20, 3, generator=generator) < 0.3
-    every, found = (normal_variation(ellipsoid, points, normals, RING_RADIUS, x) for x in (None, among))
+    every, found = (
+        normal_variation(ellipsoid, points, normals, RING_RADIUS / ellipsoid.scale, x) for x in (None, among)
+    )
     torch.testing.assert_close(found[among], every[among])
     assert bool(torch.isinf(found[~among]).all() and torch.isfinite(every).all())
 
@@ -50,7 +54,7 @@ def test_variation_is_infinite_but_among_the_contacts_asked_for(ellipsoid, gener
 def test_slope_against_automatic_differentiation(ellipsoid, generator, fingertips):
     """The ring's tangents are carried along without spin, as t - n (n . t) does to first order."""
     points, limit = on_surface(ellipsoid, generator, 4, fingertips), 0.3
-    constraint = flatness_constraint(ellipsoid, points, limit, RING_RADIUS)
+    constraint = flatness_constraint(ellipsoid, points, limit, RING_RADIUS / ellipsoid.scale)
     normals = triple_jet(ellipsoid, points).normals
     first = tangents(points, normals)
     second = torch.linalg.cross(normals, first)
@@ -87,8 +91,8 @@ def test_a_thin_wall_is_as_flat_as_its_own_side(inside: bool):
     assert len(triples) > 15
     normals = triple_jet(vessel, triples).normals
     assert bool(((out[:1] * normals[0, :1]).sum() > 0) != inside)
-    angle = normal_variation(vessel, triples, normals, RING_RADIUS)
+    angle = normal_variation(vessel, triples, normals, RING_RADIUS / vessel.scale)
     assert angle.median() < 2 * math.atan(RING_RADIUS / RADIUS)  # that of the cylinder, and as much for the camera
-    torch.testing.assert_close(angle, normal_variation(wall, triples, normals, RING_RADIUS))
+    torch.testing.assert_close(angle, normal_variation(wall, triples, normals, RING_RADIUS / wall.scale))
     limit = float(angle.max()) / INSIDE
-    assert bool((flatness_constraint(vessel, triples, limit, RING_RADIUS).value < 1e-3).all())
+    assert bool((flatness_constraint(vessel, triples, limit, RING_RADIUS / vessel.scale).value < 1e-3).all())

@@ -93,7 +93,7 @@ def test_bounds_name_ball_separation_and_table(ellipsoid, generator, fingertips)
     assert bool((lowest[above] >= 0.47).all())
     assert bool(above[lowest > 0.47 + 1e-4].all()) and bool(((lowest < 0.47) & (height > 0.47)).any())
     paper = ContactProblem.of(ellipsoid, ContactSpec.paper())
-    assert paper.table is None
+    assert paper.up is None
     assert paper.separation == LEAST_SIDE
 
 

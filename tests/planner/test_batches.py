@@ -156,7 +156,8 @@ def offer(points, seeds_of):
     pose = rigid(torch.eye(3, dtype=torch.float64).expand(g, 3, 3), torch.zeros(g, 3, dtype=torch.float64))
     seeds = IKSeeds(torch.zeros(g, 4).double(), pose, row, torch.arange(3).repeat(g, 1), energy, torch.zeros(g, 3))
     certificate = Certificate(nan, nan, nan, torch.ones(n, dtype=torch.bool), torch.zeros(n, 6).double())
-    return SeededContacts(Contacts(points, torch.zeros_like(points)), certificate, dataclasses.replace(seeds, row=row))
+    contacts, seeds = Contacts(points, torch.zeros_like(points)), dataclasses.replace(seeds, row=row)
+    return SeededContacts(contacts, certificate, seeds, torch.zeros(len(points), dtype=torch.int64))
 
 
 def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
@@ -165,7 +166,7 @@ def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
     cost = torch.rand(30, generator=rng, dtype=torch.float64)
     cost[4] = torch.inf  # no seed
     seeds = [[] if i == 4 else [float(i), i + 0.5] for i in range(30)]
-    untried = Pool()
+    untried = Pool(1)
     for rows in (range(12), range(12, 30)):
         part = offer(points[list(rows)], [seeds[i] for i in rows])
         untried.add(part, cost[list(rows)])

@@ -223,7 +223,7 @@ def test_the_work_is_bounded_and_what_the_bound_left_out_is_counted(made_up, fin
 def test_a_thing_that_no_hand_holds_is_explained_with_few_plans_and_twice_alike(monkeypatch):
     monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 1)
     plans, heard, run = [], [], Planner.run
-    monkeypatch.setattr(Planner, "run", lambda self, *given: plans.append(self.problem) or run(self, *given))
+    monkeypatch.setattr(Planner, "run", lambda self, *given: plans.append(self.stack) or run(self, *given))
     cloud, hand = ball(radius=0.2, centre=(0.0, 0.0, 0.2)), load_hand("barrett")
     own = PostureLibrary.of(hand)
     note = lambda stage, text, _: heard.append((stage, text, len(plans)))  # noqa: E731
@@ -231,5 +231,5 @@ def test_a_thing_that_no_hand_holds_is_explained_with_few_plans_and_twice_alike(
     assert str(first) == str(again) and first.best is None and "no single change helps" in str(first).lower()
     assert heard[0][0] == "funnel" and heard[0][2] == 1  # the first answer needs one plan alone
     assert len(plans) <= 2 * 2 * 2 and len(heard) == len(first.trials) + len(again.trials) + 2
-    assert all(p.request.starts <= 20 and len(p.library.joints) <= 500 for p in plans)
+    assert all(p.first.request.starts <= 20 and len(p.library.joints) <= 500 for p in plans)
     assert PostureLibrary.of(hand) is own  # the next plan need not draw it anew

@@ -27,8 +27,8 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.export import format_grasps
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand import hand_of
-from torchgrasp.planner.grasps import expected_success
 from torchgrasp.planner.request import finger_sets
+from torchgrasp.planner.run import expected_success
 
 SPEC = ContactSpec(table=0.0)
 ALL = ("index", "middle", "ring", "thumb")

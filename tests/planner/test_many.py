@@ -3,10 +3,12 @@
 import pytest
 import torch
 
-from tests.make import load_hand, same_bits
-from torchgrasp import ContactSpec, PointCloud, Status, load_object, plan_grasps
+from tests.make import cup_view, load_hand, same_bits
+from torchgrasp import ContactSpec, GraspTask, PointCloud, Status, load_object, plan_grasps
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, move
+from torchgrasp.planner.many import plan_stack
+from torchgrasp.planner.request import Request
 
 HAND = load_hand("barrett")
 UP = torch.eye(4, dtype=torch.float64)
@@ -50,3 +52,25 @@ def test_what_no_row_can_have_is_refused_before_any_work():
             plan_grasps(VIEWS, HAND, **option)
     with pytest.raises(BadArgument, match="workers"):
         plan_grasps(VIEWS[0], HAND, workers=2)
+
+
+@pytest.mark.parametrize("fingers", ["barrett", "allegro", 4])
+def test_clouds_that_are_planned_at_once_have_the_grasps_of_each_alone(fingers):
+    hand = load_hand("allegro", fingers) if fingers == 4 else load_hand(fingers)
+    clouds, spec, task = [load_object("jug").view, SMALL, cup_view(0.004)], ContactSpec(table=0.0), GraspTask(0.1)
+    requests = [Request(cloud, hand, spec, 12, task=task) for cloud in clouds]
+    together = plan_stack(requests, torch.device("cpu"))
+    assert "refused" in together[1].meta
+    for found, cloud in zip(together[::2], clouds[::2], strict=True):
+        alone = plan_grasps(cloud, hand, spec, 12, task=task)
+        assert found.meta == alone.meta and len(found) == len(alone)
+        assert share_found(alone, found) > 0.9  # rounding may move a few
+
+
+def share_found(expected, found):
+    """The share of grasps that another result has, too: with this status, these joints, pose, score and interval."""
+    rows = [
+        torch.cat([x.status[:, None], x.joints, x.obj_from_hand.flatten(1), x.score[:, None], x.interval], 1)
+        for x in (expected, found)
+    ]
+    return float((torch.cdist(*rows, p=torch.inf).amin(1) < 1e-6).double().mean())

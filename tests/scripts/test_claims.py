@@ -20,7 +20,7 @@ from torchgrasp.control.uncertainty_closing import STALLED
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.run import PLAN_LIMIT, TRIAL_LIMIT
 from torchgrasp.hand.collision_shapes import collision_pairs
-from torchgrasp.planner.grasps import BEST
+from torchgrasp.planner.run import BEST
 from torchgrasp.shape.fit import MAX_BUDGET
 from torchgrasp.specs import FLAT_RADII, SEPARATION, TIP_RADIUS
 

@@ -27,7 +27,7 @@ def whole_ball():
 def ball_body(vertices, shape=None):
     """The ball as an estimated body, with other vertices."""
     shape = whole_ball() if shape is None else shape
-    return EstimatedBody(shape, vertices, collision_field(shape, extract_mesh(shape)))
+    return EstimatedBody.around(shape, vertices, collision_field(shape, extract_mesh(shape)))
 
 
 UNEVEN = (0.3, 2.4, 4.6, 5.4, 1.3)

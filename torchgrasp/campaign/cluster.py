@@ -15,7 +15,7 @@ from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.protocols import Protocol
 from torchgrasp.evaluation.views import EvaluationSpec, View, choose_rows, plan_view, try_grasp
 from torchgrasp.hand.hand import Hand
-from torchgrasp.planner.grasps import no_grasps
+from torchgrasp.planner.many import no_grasps
 
 PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoco", "coacd")
 """Packages whose versions may change the results of a campaign."""

@@ -49,8 +49,8 @@ class Problem(abc.ABC, Generic[State, Model]):
         """Return the steps that solve the damped normal equations, and which problems go on."""
 
     @abc.abstractmethod
-    def move(self, state: State, x: Step) -> State:
-        """Return the states of the problems after the steps `x`."""
+    def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
+        """Return the states of the problems with the indices `rows` after the steps `x`."""
 
     @abc.abstractmethod
     def judge(self, model: Model, trial: Model, x: Step, damping: Damping) -> Verdict:
@@ -66,23 +66,30 @@ def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int
     """Minimise every problem of a batch by damped Gauss-Newton steps; return final states and costs.
 
     Every problem takes at most `steps` steps, each with one evaluation. No gradient flows through the minimisation.
+    Problems that have ended leave the batch. An accelerator looks for them in few steps only, because the host waits.
     """
     whole, rows = state, torch.arange(len(state), device=next(iter(named_tensors(state).values())).device)
     model = problem.linearise(state, rows)
     costs, damping = model.cost, torch.full_like(model.cost, problem.first_damping)
-    for _ in range(steps):
+    going, every = torch.ones_like(rows, dtype=torch.bool), 1 if rows.device.type == "cpu" else 6
+    for k in range(steps):
         x, taken = problem.step(model, damping)
-        left = torch.nonzero(taken)[:, 0]  # the only wait for the device in a step
-        if not len(left):
-            break
-        if len(left) < len(taken):
-            whole, costs = put(whole, rows, state), costs.index_copy(0, rows, model.cost)
-            rows, state, model, x, damping = rows[left], state[left], model[left], x[left], damping[left]
-        trial_state = problem.move(state, x)
+        going = going & taken
+        if k % every == 0:
+            left = torch.nonzero(going)[:, 0]  # the only wait for the device
+            if not len(left):
+                break
+            if len(left) < len(going):
+                whole, costs = put(whole, rows, state), costs.index_copy(0, rows, model.cost)
+                rows, state, model, x, damping = rows[left], state[left], model[left], x[left], damping[left]
+                going = going[left]
+        trial_state = problem.move(state, x, rows)
         trial = problem.linearise(trial_state, rows)
-        accepted, damping = problem.judge(model, trial, x, damping)
-        state = pick(accepted, trial_state, state)
-        model = pick(accepted, trial, problem.refuse(model, trial))
+        accepted, after = problem.judge(model, trial, x, damping)
+        refused = problem.refuse(model, trial)
+        if every > 1:  # problems that have ended, but have not left, stay as they are
+            accepted, after, refused = accepted & going, torch.where(going, after, damping), pick(going, refused, model)
+        state, model, damping = pick(accepted, trial_state, state), pick(accepted, trial, refused), after
     return put(whole, rows, state), costs.index_copy(0, rows, model.cost)
 
 
@@ -122,7 +129,7 @@ class LeastSquares(Problem[State, LinearResiduals]):
         x = x * (self.largest / x.abs().amax(1, keepdim=True).clamp_min(self.largest))
         return x, ~(model.cost < self.solved) & torch.isfinite(damping)
 
-    def move(self, state: State, x: Step) -> State:
+    def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
         """Return the states of the problems after the steps `x`."""
         return self.moved(state, x)
 

@@ -1,7 +1,8 @@
 """Signed distance fields on grids, for collision checks."""
 
+import abc
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,9 +20,74 @@ FAR_SHARE = 8  # one of so many samples of the surface is used for nodes beyond 
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
 
 
+class Grid(NamedTuple):
+    """The grid of points, or of each row of points.
+
+    Args:
+        origin, spacing: of the nodes [m].
+        last: the last node on each axis.
+        stride: number of values between neighbours on the x and on the y axis.
+        first: the first value.
+        corners: steps from the first corner of a cell to all corners, among the values.
+    """
+
+    origin: Float[Tensor, "*b 3"]
+    spacing: float | Float[Tensor, "*b 1"]
+    last: Int[Tensor, "*b 3"]
+    stride: Any
+    first: Any
+    corners: Int[Tensor, "8 *b"]
+
+
+class DistanceField(Value, abc.ABC):
+    """Signed distances [m] at the `nodes` of a grid, or of the grids of several objects, one for each row of points."""
+
+    nodes: Any  # Float[Tensor, "n"]
+    spacing: Any  # [m], a number or that of each row
+
+    @abc.abstractmethod
+    def rows(self, index: Int[Tensor, "k"]) -> "DistanceField":
+        """Return the fields of some of the rows of points; a single field is that of all rows."""
+
+    @checked
+    @abc.abstractmethod
+    def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return the signed distance [m] of the grid node nearest to each point, outside the grid of a border node."""
+
+    @abc.abstractmethod
+    def _grid(self, points: Float[Tensor, "*b 3"]) -> Grid:
+        """Return the grid of the points."""
+
+    @checked(gradients=True)
+    def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+        """Return the interpolated signed distance [m] at each point, and its gradient.
+
+        Outside the grid, the distance [m] from the grid is added to the value at the border.
+        """
+        origin, spacing, last, (dx, dy), first, corners = self._grid(points)
+        position = (points - origin) / spacing
+        inside = torch.minimum(position.clamp_min(0), last.to(points))
+        cell = torch.minimum(inside.detach().long(), last - 1)
+        fx, fy, fz = (inside - cell).unbind(-1)
+        flat = cell[..., 0] * dx + cell[..., 1] * dy + cell[..., 2] + first
+        corner = self.nodes[flat + corners].to(points)
+        z = [torch.lerp(corner[2 * i], corner[2 * i + 1], fz) for i in range(4)]
+        y = [torch.lerp(z[0], z[1], fy), torch.lerp(z[2], z[3], fy)]
+        slope_z = [corner[2 * i + 1] - corner[2 * i] for i in range(4)]
+        slope_z = torch.lerp(torch.lerp(slope_z[0], slope_z[1], fy), torch.lerp(slope_z[2], slope_z[3], fy), fx)
+        slope_y = torch.lerp(z[1] - z[0], z[3] - z[2], fx)
+        slope = torch.stack([y[1] - y[0], slope_y, slope_z], -1) / spacing
+        beyond = (position - inside) * spacing
+        outside = (beyond != 0).any(-1, keepdim=True)  # the norm of a zero vector has no second derivative
+        length = torch.linalg.vector_norm(torch.where(outside, beyond, 1.0), dim=-1, keepdim=True)
+        away, outward = torch.where(outside, length, 0.0)[..., 0], beyond / length
+        gradient = torch.where(beyond != 0, 0.0, slope) + outward
+        return torch.lerp(y[0], y[1], fx) + away, gradient
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
-class SignedDistanceField(Value):
+class SignedDistanceField(DistanceField):
     """Signed distances [m] on a grid, negative inside; node i is at origin + i * spacing.
 
     >>> ball = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3).norm(dim=1).reshape(41, 41, 41) - 0.05
@@ -34,12 +100,15 @@ class SignedDistanceField(Value):
     spacing: float
     values: Float[Tensor, "x y z"]
 
-    @kept
-    def _cells(self) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
-        """The last node along each axis, and the steps from the first corner of a cell to all corners in `values`."""
-        shape, corner = self.values.shape, torch.arange(8, device=self.values.device)
-        last = torch.tensor(shape, device=corner.device) - 1
-        return last, (corner // 4 * shape[1] + corner // 2 % 2) * shape[2] + corner % 2
+    @property
+    def nodes(self) -> Float[Tensor, "n"]:
+        """The distances at all nodes."""
+        return self.values.reshape(-1)
+
+    @checked
+    def rows(self, index: Int[Tensor, "k"]) -> "SignedDistanceField":
+        """Return the fields of some of the rows of points; this one is that of all rows."""
+        return self
 
     @checked
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -48,34 +117,24 @@ class SignedDistanceField(Value):
         for x, low, count in zip(points.unbind(-1), self.origin.to(points), self.values.shape, strict=True):
             node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
             flat = node.long() if isinstance(flat, int) else flat * count + node.long()
-        return self.values.reshape(-1)[flat].to(points)
+        return self.nodes[flat].to(points)
 
-    @checked(gradients=True)
-    def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return the interpolated signed distance [m] at each point, and its gradient.
+    @kept
+    def _cells(self) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
+        """The last node along each axis, and the steps from the first corner of a cell to all corners in `values`."""
+        shape = torch.tensor(self.values.shape, device=self.values.device)
+        return shape - 1, corner_steps(shape[1] * shape[2], shape[2])
 
-        Outside the grid, the distance [m] from the grid is added to the value at the border.
-        """
-        _, ny, nz = self.values.shape
-        position = (points - self.origin.to(points)) / self.spacing
-        last, steps = self._cells
-        inside = torch.minimum(position.clamp_min(0), last.to(points))
-        cell = torch.minimum(inside.detach().long(), last - 1)
-        fx, fy, fz = (inside - cell).unbind(-1)
-        flat = (cell[..., 0] * ny + cell[..., 1]) * nz + cell[..., 2]
-        corner = self.values.reshape(-1)[flat + steps.view(-1, *[1] * flat.ndim)].to(points)
-        z = [torch.lerp(corner[2 * i], corner[2 * i + 1], fz) for i in range(4)]
-        y = [torch.lerp(z[0], z[1], fy), torch.lerp(z[2], z[3], fy)]
-        slope_z = [corner[2 * i + 1] - corner[2 * i] for i in range(4)]
-        slope_z = torch.lerp(torch.lerp(slope_z[0], slope_z[1], fy), torch.lerp(slope_z[2], slope_z[3], fy), fx)
-        slope_y = torch.lerp(z[1] - z[0], z[3] - z[2], fx)
-        slope = torch.stack([y[1] - y[0], slope_y, slope_z], -1) / self.spacing
-        beyond = (position - inside) * self.spacing
-        outside = (beyond != 0).any(-1, keepdim=True)  # the norm of a zero vector has no second derivative
-        length = torch.linalg.vector_norm(torch.where(outside, beyond, 1.0), dim=-1, keepdim=True)
-        away, outward = torch.where(outside, length, 0.0)[..., 0], beyond / length
-        gradient = torch.where(beyond != 0, 0.0, slope) + outward
-        return torch.lerp(y[0], y[1], fx) + away, gradient
+    def _grid(self, points: Float[Tensor, "*b 3"]) -> Grid:
+        (last, corners), (_, ny, nz) = self._cells, self.values.shape
+        corners = corners.view(-1, *[1] * (points.ndim - 1))
+        return Grid(self.origin.to(points), self.spacing, last, (ny * nz, nz), 0, corners)
+
+
+def corner_steps(dx: Int[Tensor, "*b"], dy: Int[Tensor, "*b"]) -> Int[Tensor, "8 *b"]:
+    """Return the steps from the first corner of a cell to all eight corners, given the strides on the x and y axis."""
+    corner = torch.arange(8, device=dx.device).view(-1, *[1] * dx.ndim)
+    return corner // 4 * dx + corner // 2 % 2 * dy + corner % 2
 
 
 @checked

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cached_property
 from typing import Annotated, NamedTuple
 
@@ -17,6 +17,8 @@ from torchgrasp.hand.kinematics import map_points
 
 Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]  # largest separation [m] that is needed exactly
 Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]  # axes and centres of shapes in the palm's frame
+Parts = list[tuple[int, slice]]
+"""Each kind of pair, named by its number of spheres, with the slice of this kind among pairs sorted by kind."""
 Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]]
 """Function of pair indices; it returns the directions in which second shapes leave the first, and contact points."""
 
@@ -60,16 +62,16 @@ class SelfCollision(Value):
             near = distance - self._sums(self._bounding, distance) <= limit
             dense = not torch.compiler.is_compiling() and not is_known(near)  # torch.vmap cannot select entries
             every = torch.ones(near.shape, dtype=torch.bool, device=near.device) if dense else near
-            pair, row = torch.nonzero(every, as_tuple=True)
-        apart = self._separations(shapes, pair, row)
+            pair, row, parts = self._choose(every)
+        apart = self._separations(shapes, pair, row, parts)
         apart = torch.where(near[pair, row], apart, torch.inf) if dense else apart
         return least.scatter_reduce(0, row, apart, "amin")
 
     @checked
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
         """Return each pair's signed separation [m] in each posture; above `below` it is that of bounding spheres."""
-        shapes, apart, pair, row = self._near(frames, below)
-        return apart.index_put((pair, row), self._separations(shapes, pair, row))
+        shapes, apart, pair, row, parts = self._near(frames, below)
+        return apart.index_put((pair, row), self._separations(shapes, pair, row, parts))
 
     @checked
     def pushes(
@@ -80,13 +82,18 @@ class SelfCollision(Value):
         A wrench is the derivative of a separation by a twist (translation, rotation) of the second shape. The last
         wrench is zero, and belongs to separations above `below`.
         """
-        shapes, apart, pair, row = self._near(frames, below)
+        shapes, apart, pair, row, parts = self._near(frames, below)
         separation, wrench = apart.new_zeros(len(pair)), apart.new_zeros(6, len(pair) + 1)
-        for kind, at in self._split(pair):
+        for kind, at in parts:
             separation[at], push = self._of_kind(kind, shapes, pair[at], row[at])
-            close = torch.nonzero(separation[at] < below)[:, 0]
+            is_close = separation[at] < below
+            if pair.device.type == "cpu":
+                close = torch.nonzero(is_close)[:, 0]
+            else:  # wrenches of all cost less than a wait
+                close = torch.arange(at.stop - at.start, device=pair.device)
             if len(close):
                 force, point = push(close)
+                force = force * is_close[close].to(force)
                 wrench[:, at.start + close] = torch.cat([force, torch.linalg.cross(point, force, dim=0)])
         number = torch.full_like(apart, len(pair), dtype=torch.long)
         number[pair, row] = torch.arange(len(pair), device=pair.device)
@@ -118,18 +125,17 @@ class SelfCollision(Value):
 
     def _near(
         self, frames: Float[Tensor, "3 4 l n"], below: float
-    ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"]]:
-        """Return the placed shapes, the separations [m] of the bounding spheres of each pair, and two index vectors.
+    ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"], Parts]:
+        """Return the placed shapes, the separations [m] of the bounding spheres of each pair, and the near ones.
 
-        The index vectors hold the pair and the posture of each separation that is less than `below`.
+        Two index vectors hold the pair and the posture of each separation that is less than `below`.
         """
         if not torch.compiler.is_compiling() and not is_known(frames):
             raise BadArgument("frames", "a tensor inside torch.vmap", "a plain batch; `clearance` takes both")
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding, distance)
-        pair, row = torch.nonzero(apart < below, as_tuple=True)
-        return shapes, apart, pair, row
+        return shapes, apart, *self._choose(apart < below)
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
         """Return the distance [m] between the centres of the two shapes of each pair."""
@@ -142,11 +148,6 @@ class SelfCollision(Value):
         return int(self.link.max()) + 1 if len(self.link) else 0
 
     @kept
-    def _ends(self) -> Int[Tensor, "2"]:
-        """The ends of the first and of the second kind of pair."""
-        return torch.tensor([self.kinds[0], self.kinds[0] + self.kinds[1]], device=self.pairs.device)
-
-    @kept
     def _bounding(self) -> Float[Tensor, " s"]:
         """The radius [m] of the bounding sphere of each collision shape."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
@@ -155,17 +156,24 @@ class SelfCollision(Value):
         """Return for each pair of shapes the sum of their radii, given the `radius` of every shape."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
-    def _split(self, pair: Int[Tensor, " k"]) -> Iterator[tuple[int, slice]]:
-        """Yield each kind of pair, named by its number of spheres, with the slice of this kind among sorted pairs."""
-        ends = torch.searchsorted(pair, self._ends).tolist()
-        for kind, (low, high) in enumerate(itertools.pairwise((0, *ends, len(pair)))):
-            if high > low:
-                yield kind, slice(low, high)
+    def _choose(self, near: Bool[Tensor, "p n"]) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"], Parts]:
+        """Return the pairs and postures of a mask, sorted by pair, and the slice of each kind of pair."""
+        if near.device.type == "cpu":
+            pair, row = torch.nonzero(near, as_tuple=True)
+            counts = [int((pair < end).sum()) for end in itertools.accumulate(self.kinds)]
+        else:  # one wait, for the sizes
+            ends = [part.sum() for part in near.split(self.kinds)]
+            counts = torch.stack(ends).cumsum(0).tolist()
+            pair, row = torch.nonzero_static(near, size=counts[-1]).unbind(1)
+        bounds = itertools.pairwise((0, *counts))
+        return pair, row, [(kind, slice(low, high)) for kind, (low, high) in enumerate(bounds) if high > low]
 
-    def _separations(self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
+    def _separations(
+        self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"], parts: Parts
+    ) -> Float[Tensor, " k"]:
         """Return separations [m] of pairs of shapes; entry i is of pair `pair[i]` in posture `row[i]`."""
-        parts = [self._of_kind(kind, shapes, pair[at], row[at])[0] for kind, at in self._split(pair)]
-        return torch.cat(parts) if parts else shapes[1].new_zeros(0)
+        found = [self._of_kind(kind, shapes, pair[at], row[at])[0] for kind, at in parts]
+        return torch.cat(found) if found else shapes[1].new_zeros(0)
 
     def _of_kind(
         self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]

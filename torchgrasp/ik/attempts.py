@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, join, map_tensors
+from torchgrasp.base import Batch, at_once, join, map_tensors
 from torchgrasp.checks import checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
@@ -97,14 +97,14 @@ def best_first(grasps: Grasps) -> Grasps:
 def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, cobyla: bool = False) -> Grasps:
     """Refine each seed on its fixed contacts; return checked grasps. `cobyla` selects the paper's solver and checks."""
     contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
+    own, status = problem.rows(seeds.row), torch.full_like(seeds.row, Status.OK)
     if cobyla:
         configuration = refine_by_cobyla(problem.hand, start, contacts, problem.world)
     else:
-        configuration = refine(problem.hand, start, contacts, problem.world, steps=steps)
-    certificate, status = problem.certificate[seeds.row], torch.full_like(seeds.row, Status.OK)
-    candidates = GraspCandidates(configuration, contacts, certificate, seeds.permutation, status)
+        configuration = refine(problem.hand, start, contacts, own.world, steps=steps)
+    candidates = GraspCandidates(configuration, contacts, own.certificate, seeds.permutation, status)
     tolerance = PAPER_TOLERANCE if cobyla else TIP_TOLERANCE
-    return check_candidates(problem, candidates, rolling=not cobyla, tolerance=tolerance)
+    return check_candidates(own, candidates, rolling=not cobyla, tolerance=tolerance)
 
 
 def try_best_seeds(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Attempts[Grasps]:
@@ -117,11 +117,12 @@ def try_best_seeds(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATION
 def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
     """Return for each seed the sum of squared errors [mm2] of fingertips and clearances, before any refinement."""
     costs = [seeds.energy[:0]]
-    for rows in torch.arange(len(seeds), device=seeds.row.device).split(256):  # their temporaries stay in the cache
+    for rows in torch.arange(len(seeds), device=seeds.row.device).split(at_once(seeds.row, 256)):
         part = seeds[rows]
         start, contacts = Configuration(part.joints, part.obj_from_hand), assign(problem.contacts, part)
         target = tip_targets(problem.hand, contacts)
-        residual, _ = grasp_residuals(problem.hand, start, target, contacts.normals, problem.world, tips_touch=True)
+        world = problem.world.rows(part.row)
+        residual, _ = grasp_residuals(problem.hand, start, target, contacts.normals, world, tips_touch=True)
         costs.append(residual.square().sum(1))
     return torch.cat(costs)
 

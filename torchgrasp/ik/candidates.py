@@ -35,6 +35,7 @@ ANGLE_TOLERANCE = math.radians(2)  # largest angle [rad] of a contact direction 
 class GraspProblem(Value):
     """The input of a grasp solver: a hand, contact sets with certificates of force closure, and the collision world.
 
+    Contact sets of several objects have a centre each, and a world that knows the object of each row.
     Grasps near `center`, the object's centre [m], score higher. The function `reachable` tells which hand poses an arm
     can reach; without this function, every pose counts as reachable. A hand that `descends` may begin above its pose
     where its opened links would be in the table (`opened_pose`).
@@ -54,12 +55,19 @@ class GraspProblem(Value):
     contacts: Annotated[Contacts, Rows("b")]
     certificate: Annotated[Certificate, Rows("b")]
     world: CollisionWorld
-    center: Float[Tensor, "3"]
+    center: Float[Tensor, "*c 3"]
     reachable: Reachable | None = None
     descends: bool = False
 
     def __post_init__(self) -> None:
         self.contacts.require_std()
+
+    @checked
+    def rows(self, index: Int[Tensor, "k"]) -> "GraspProblem":
+        """Return the problem of some of the contact sets."""
+        center = self.center if self.center.ndim == 1 else self.center[index]
+        contacts, certificate, world = self.contacts[index], self.certificate[index], self.world.rows(index)
+        return GraspProblem(self.hand, contacts, certificate, world, center, self.reachable, self.descends)
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
@@ -162,8 +170,9 @@ def check_candidates(
     planned = torch.where(unproven, int(Status.NOT_CLOSED), candidates.status)
     errors = measure_errors(hand, configuration, contacts, world, rolling, tolerance)
 
-    pregrasp, touching = configuration.joints.clone(), (planned == Status.OK) & (errors.status == Status.OK)
-    pregrasp[touching] = open_hand(hand, configuration[touching], contacts[touching], world)
+    pregrasp = configuration.joints.clone()
+    touching = torch.nonzero((planned == Status.OK) & (errors.status == Status.OK))[:, 0]
+    pregrasp[touching] = open_hand(hand, configuration[touching], contacts[touching], world.rows(touching))
     opened = Configuration(pregrasp, configuration.obj_from_hand)
     if problem.descends:
         raised = opened_pose(hand, pregrasp, opened.obj_from_hand, world.plane)
@@ -172,8 +181,8 @@ def check_candidates(
     status = torch.where(blocked, int(Status.PREGRASP), errors.status)
 
     approach = rotate(configuration.obj_from_hand, hand.approach.to(problem.center)[None])[:, 0]
-    ready = status == Status.OK
-    approach[ready], clearance = find_approach(hand, opened[ready], world)
+    ready = torch.nonzero(status == Status.OK)[:, 0]
+    approach[ready], clearance = find_approach(hand, opened[ready], world.rows(ready))
     status[ready] = torch.where(clearance >= 0, int(Status.OK), int(Status.NO_APPROACH))
     if world.obstacles is not None:
         _keep_clear(problem, configuration, opened, approach, status)
@@ -194,7 +203,7 @@ def check_candidates(
         certificate=certificate,
         score=score(contacts, errors.normal_angle, problem.center),
         status=torch.where(planned == Status.OK, status, planned),
-        known=torch.ones_like(touching),
+        known=torch.ones_like(blocked),
         interval=torch.zeros_like(errors.clearance)[:, None].repeat(1, 2),
     )
 

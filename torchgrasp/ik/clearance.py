@@ -7,13 +7,13 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import Value, settle
 from torchgrasp.checks import Range, checked
 from torchgrasp.geometry.plane import Plane, as_plane
-from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.geometry.signed_distance import DistanceField, SignedDistanceField
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.ik.configuration import Rows, SpatialJacobian
 from torchgrasp.scene.occupancy import Occupancy
@@ -103,7 +103,7 @@ class CollisionWorld(Value):
     0.02
     """
 
-    field: SignedDistanceField | None = None
+    field: DistanceField | None = None
     table: Plane | float | None = None
     obstacles: Obstacles | None = None
 
@@ -114,10 +114,10 @@ class CollisionWorld(Value):
     def plane(self) -> Plane | None:
         """The table as a plane, on the device of the distance fields, or None without a table."""
         plane = as_plane(self.table)
-        return plane if plane is None or not self.fields else settle(plane, self.fields[0].origin.device)
+        return plane if plane is None or not self.fields else settle(plane, self.fields[0].nodes.device)
 
     @property
-    def fields(self) -> tuple[SignedDistanceField, ...]:
+    def fields(self) -> tuple[DistanceField, ...]:
         """The distance fields of object and obstacles, if any."""
         return tuple(x for x in (self.field, self.obstacles and self.obstacles.field) if x is not None)
 
@@ -125,6 +125,15 @@ class CollisionWorld(Value):
     def alone(self) -> "CollisionWorld":
         """The same world without obstacles."""
         return dataclasses.replace(self, obstacles=None)
+
+    @checked
+    def rows(self, index: Int[Tensor, "k"]) -> "CollisionWorld":
+        """Return the surroundings of some of the rows of hands; a single object's are those of all rows."""
+        if self.field is None or isinstance(self.field, SignedDistanceField):
+            return self
+        new = object.__new__(CollisionWorld)
+        vars(new).update(vars(self) | {"field": self.field.rows(index), "plane": self.plane})
+        return new
 
     @property
     def guarded(self) -> bool:

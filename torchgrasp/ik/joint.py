@@ -6,14 +6,13 @@ between two contacts; the pulls give the contact forces.
 """
 
 import dataclasses
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch
+from torchgrasp.base import Batch, at_once, spread
 from torchgrasp.checks import checked
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
@@ -25,7 +24,7 @@ from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import FlatnessConstraint, check_feasibility, flatness_constraint
-from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet
+from torchgrasp.plan.problem import ContactProblem, Shape, rows_of, triple_jet, triple_mean_jet
 from torchgrasp.plan.solver import equal_tensions, normalise_tensions, project
 from torchgrasp.shape.values import SurfaceJet
 from torchgrasp.specs import ContactSpec
@@ -67,17 +66,22 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """The least-squares problem of hand and contacts together: hand, object shape, contact `spec`, collision world."""
+    """The least-squares problem of hand and contacts together: hand, object shape, constraints, collision world."""
 
     hand: Hand
     shape: Shape
-    spec: ContactSpec
+    contact_problem: ContactProblem
     world: CollisionWorld
 
-    @cached_property
-    def contact_problem(self) -> ContactProblem:
-        """The constraints on the contacts alone, without the hand."""
-        return ContactProblem.of(self.shape, self.spec)
+    @classmethod
+    def of(cls, problem: GraspProblem, shape: Shape, contact_problem: ContactProblem) -> "JointProblem":
+        """Return the problem of the hand and the contact sets of `problem`."""
+        return cls(problem.hand, shape, contact_problem, problem.world)
+
+    def rows(self, index: Int[Tensor, "k"]) -> "JointProblem":
+        """Return the problems of some of the rows."""
+        shape, contact_problem = rows_of(self.shape, index), self.contact_problem.rows(index)
+        return JointProblem(self.hand, shape, contact_problem, self.world.rows(index))
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
         """Return all residuals [mm] and their Jacobian with respect to hand pose, joints, contacts and tensions."""
@@ -104,7 +108,8 @@ class JointProblem:
         """Return the derivatives of tip residuals by contact points; `outside` marks contacts outside pads' cones."""
         hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
         identity, own = (torch.eye(k, dtype=normals.dtype, device=normals.device) for k in (3, len(hand.tips)))
-        target = float(self.shape.scale) * identity + hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
+        rolled = hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
+        target = spread(self.shape.scale, rolled) * identity + rolled
         pads = spatial.pads.permute(2, 1, 0)
         tilt = (pads[..., None, :] @ normal_jacobian)[..., 0, :] * outside[..., None]
         tips = torch.einsum("gixy,ij->gixjy", target, own).flatten(3).flatten(1, 2)
@@ -119,53 +124,55 @@ class JointProblem:
             bounds = torch.cat([bounds, flat.values(state.points)], 1)
             by_tension = flat.by_points.new_zeros(*flat.by_points.shape[:2], state.tension.shape[1])
             bounds_by_x = torch.cat([bounds_by_x, torch.cat([flat.by_points, by_tension], 2)], 1)
-        violated, unit_length = (bounds > 0).to(bounds), float(self.shape.scale) / MILLIMETRE
+        violated = (bounds > 0).to(bounds)
         residual = torch.cat([rows.surface, violated * bounds], 1)
         jacobian = torch.cat([rows.surface_by_x, violated[..., None] * bounds_by_x], 1)
-        weight = CONTACT_WEIGHT * unit_length
-        return weight * residual, weight * jacobian
+        weight = CONTACT_WEIGHT * (self.shape.scale / MILLIMETRE)
+        return spread(weight, residual) * residual, spread(weight, jacobian) * jacobian
 
     def solve(
         self, configuration: Configuration, points: Float[Tensor, "g f 3"]
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
         """Optimise hands and contacts together; return configurations, contacts and indices of grasps of low cost."""
-        largest, radius = self.spec.flatness, self.spec.ring_radius
+        own, largest = self, self.contact_problem.spec.flatness
         rows, tension = torch.arange(len(points), device=points.device), equal_tensions(points)
         for stage in STAGES:
-            flat, jet = None, triple_jet(self.shape, points)
+            flat, jet = None, triple_jet(own.shape, points)
             state = JointState(configuration, points, tension, jet.variance, jet.variance_gradient)
             if stage.flat and largest is not None:
-                flat = flatness_constraint(self.shape, points, largest, radius)
+                flat = flatness_constraint(own.shape, points, largest, own.contact_problem.ring)
             sliding = LeastSquares(
-                lambda x, at, flat=flat: self.residuals(x, None if flat is None else flat[at]),
+                lambda x, at, flat=flat, own=own: own.rows(at).residuals(x, None if flat is None else flat[at]),
                 lambda x, step: x.integrate(self.hand, step),
                 largest=HAND_STEP,
             )
             state, cost = levenberg_marquardt(sliding, state, stage.steps)
             kept = torch.nonzero(cost < stage.hopeless)[:, 0]
             configuration, points, tension = state.configuration[kept], state.points[kept], state.tension[kept]
-            rows = rows[kept]
+            rows, own = rows[kept], own.rows(kept)
             if not len(rows):
                 break
         return configuration, points, rows
 
 
 def solve_sliding(
-    problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec, attempts: Attempts[Grasps]
+    joint_problem: JointProblem, problem: GraspProblem, seeds: IKSeeds, attempts: Attempts[Grasps]
 ) -> None:
     """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps to `attempts`."""
-    joint_problem = JointProblem(problem.hand, shape, spec, problem.world)
     count = 8 if len(problem.hand.tips) == 3 else 2
     chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, count)
-    for part in (chosen[k : k + 512] for k in range(0, len(chosen), 512)):
-        points = shape.normalise(assign(problem.contacts, part).points)
+    size = at_once(chosen.row, 512)
+    for part in (chosen[k : k + size] for k in range(0, len(chosen), size)):
+        own = joint_problem.rows(part.row)
+        points = own.shape.normalise(assign(problem.contacts, part).points)
         start = Configuration(part.joints, part.obj_from_hand)
-        configuration, points, left = joint_problem.solve(start, points)
-        kept, on_surface = part[left], project(shape, points, 3)  # the solver leaves contacts within 0.1 mm
-        plan = check_feasibility(shape, spec, on_surface)
-        certificate = certify(plan.contacts, spec)
+        configuration, points, left = own.solve(start, points)
+        kept, own = part[left], own.rows(left)
+        on_surface = project(own.shape, points, 3)  # the solver leaves contacts within 0.1 mm
+        plan = check_feasibility(own.shape, own.contact_problem, on_surface)
+        certificate = certify(plan.contacts, own.contact_problem.spec)
         candidates = GraspCandidates(configuration, plan.contacts, certificate, kept.permutation, plan.status)
-        attempts.add(check_candidates(problem, candidates), kept.row)
+        attempts.add(check_candidates(problem.rows(kept.row), candidates), kept.row)
 
 
 @checked
@@ -186,5 +193,5 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
     """
     seeds = problem.drop_unreachable(seeds)
     attempts = try_best_seeds(problem, seeds)
-    solve_sliding(problem, seeds, shape, spec, attempts)
+    solve_sliding(JointProblem.of(problem, shape, ContactProblem.of(shape, spec)), problem, seeds, attempts)
     return best_first(best_grasps(attempts)[0])

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import spread
 from torchgrasp.checks import checked
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, unit
@@ -39,7 +40,7 @@ def find_approach(
         if not len(touching):
             break
         direction = candidates[touching, choice[touching]]
-        exact = _clearance(centres[touching], radius, direction, world, exact=True)
+        exact = _clearance(centres[touching], radius, direction, world.rows(touching), exact=True)
         better = exact > clearance[touching]
         chosen[touching] = torch.where(better[:, None], direction, chosen[touching])
         clearance[touching] = torch.where(better, exact, clearance[touching])
@@ -99,8 +100,9 @@ def _clearance(
         near, first = coarse.min(1)
         if exact:  # interpolate only spheres that may have the least clearance: nodes are up to 1.2 spacings away
             near = field.query(path[torch.arange(len(path), device=path.device), first])[0] - radius[first]
-            row, sphere = torch.nonzero(coarse < near[:, None] + 1.2 * field.spacing, as_tuple=True)
-            near = near.scatter_reduce(0, row, field.query(path[row, sphere])[0] - radius[sphere], "amin")
+            row, sphere = torch.nonzero(coarse < near[:, None] + 1.2 * spread(field.spacing, coarse), as_tuple=True)
+            closer = field.rows(row).query(path[row, sphere])[0] - radius[sphere]
+            near = near.scatter_reduce(0, row, closer, "amin")
         least = torch.minimum(least, near)
     if world.plane is not None:
         least = torch.minimum(least, (along(path, world.plane) - radius).amin(1) - world.plane.offset)

@@ -33,7 +33,7 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
     return (sine / cosine.clamp_min(1e-3)).amax(1)
 
 
-def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "3"]) -> Float[Tensor, "g"]:
+def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "*g 3"]) -> Float[Tensor, "g"]:
     """Return the geometric score of each grasp, at most 0; a higher score is better.
 
     Three things lower it: the contacts' distance from `center` [m], the friction needed, and the angle off the pads.

@@ -71,7 +71,8 @@ def refine(
     target, normals = tip_targets(hand, contacts), contacts.normals
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
-        return grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=True)
+        around = None if world is None else world.rows(rows)
+        return grasp_residuals(hand, state, target[rows], normals[rows], around, tips_touch=True)
 
     problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, step), solved, HAND_STEP)
     return levenberg_marquardt(problem, configuration, steps)[0]
@@ -87,7 +88,8 @@ def open_hand(hand: Hand, grasp: Configuration, contacts: Contacts, world: Colli
         target = target - height * up + torch.maximum(height, lowest) * up  # exact where the table is horizontal
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
-        residual, jacobian = grasp_residuals(hand, state, target[rows], normals[rows], world, tips_touch=False)
+        around = world.rows(rows)
+        residual, jacobian = grasp_residuals(hand, state, target[rows], normals[rows], around, tips_touch=False)
         return residual, jacobian[..., 6:]
 
     def integrate(state: Configuration, step: Float[Tensor, "a h"]) -> Configuration:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, check_device, check_whole, join, settle
+from torchgrasp.base import Value, at_once, check_device, check_whole, join, settle
 from torchgrasp.checks import Count, Positive, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
@@ -138,7 +138,7 @@ def nearest_postures(
     centres = contacts.points.double()[:, permutations] - radius[:, None] * inward  # (n, p, f, 3)
     framed = ~degenerate(triangle_of(centres))
     parts = []
-    for row in torch.nonzero(framed.any(1))[:, 0].split(64):  # bounds the memory
+    for row in torch.nonzero(framed.any(1))[:, 0].split(at_once(centres, 64)):  # bounds the memory
         obj_from_vf, wanted = _describe(centres[row], inward[row], framed[row])
         assignment = _likely_assignments(wanted, given, framed[row])
         at = torch.arange(len(row), device=device)[:, None]
@@ -149,7 +149,7 @@ def nearest_postures(
         obj_from_hand = obj_from_vf[at, order] @ library.vf_from_hand[sample]
         spheres = apply(obj_from_hand.float(), library.spheres[sample])
         tips = 2 * energy * (TIP_WEIGHT * LENGTH_SCALE / MILLIMETRE) ** 2  # squared millimetres, weighed as in `refine`
-        cost = tips + collision_cost(spheres, library.hand.collision_spheres, world)
+        cost = tips + collision_cost(spheres, library.hand.collision_spheres, world.rows(row))
         if reachable is None:
             best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
             b = at.repeat_interleave(n_seeds)  # one row for each seed

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch
+from torchgrasp.base import Batch, spread
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.geometry.linalg import unit
@@ -22,10 +22,9 @@ from torchgrasp.plan.closure import (
     tangents,
     wrenches,
 )
-from torchgrasp.plan.problem import ContactProblem, Shape, triple_jet, triple_mean_jet, walls_at
+from torchgrasp.plan.problem import ContactProblem, PerRow, Shape, rows_of, triple_jet, triple_mean_jet, walls_at
 from torchgrasp.plan.solver import project
 from torchgrasp.shape.values import surface_deviation
-from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Contacts
 
 JUDGED_POINTS, GUIDING_POINTS = 8, 4  # points of the ring on which a plan is judged, and fewer that guide a solver
@@ -38,18 +37,19 @@ def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, 
 
 
 def normal_variation(
-    shape: Shape, points: Vectors, normals: Vectors, radius: float, among: Bool[Tensor, "b f"] | None = None
+    shape: Shape, points: Vectors, normals: Vectors, radius: PerRow, among: Bool[Tensor, "b f"] | None = None
 ) -> Float[Tensor, "b f"]:
     """Return for each contact the largest angle [rad] between its normal and the normals on a ring around it.
 
-    The ring has the given `radius` [m]. Contacts outside the mask `among` have infinite angles.
+    The ring has the given normalised `radius`. Contacts outside the mask `among` have infinite angles.
     """
     variation = torch.full_like(points[..., 0], math.inf)
     among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
-    ring = points[:, :, None] + radius / float(shape.scale) * ring_directions(normals, points, JUDGED_POINTS)
+    directions = ring_directions(normals, points, JUDGED_POINTS)
+    ring = points[:, :, None] + spread(radius, directions) * directions
     for wall, own in walls_at(shape, points):
-        own = own & among
-        variation[own] = _wall_variation(wall, ring[own], normals[own])
+        own = torch.nonzero(own & among).unbind(1)
+        variation[own] = _wall_variation(rows_of(wall, own[0]), ring[own], normals[own])
     return variation
 
 
@@ -79,11 +79,11 @@ class FlatnessConstraint(Batch):
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
-def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
+def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: PerRow) -> FlatnessConstraint:
     """Model by how much the normals around each contact differ from its normal beyond the angle `flatness` [rad].
 
-    A value is |n - n_k|, for the normals n at a contact and n_k on a ring of `radius` [m] around it, less the chord of
-    the angle `flatness`. It is multiplied by the ring's radius in normalised units, and so is a length.
+    A value is |n - n_k|, for the normals n at a contact and n_k on a ring of normalised `radius` around it, less the
+    chord of the angle `flatness`. It is multiplied by the ring's radius, and so is a length.
     """
     (first, _), *others = walls_at(shape, points)
     found = _wall_constraint(first, points, flatness, radius)
@@ -94,15 +94,16 @@ def flatness_constraint(shape: Shape, points: Vectors, flatness: float, radius: 
     return found
 
 
-def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: float) -> FlatnessConstraint:
+def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: PerRow) -> FlatnessConstraint:
     """Return the linear flatness constraint for contacts on one surface of the shape, such as a vessel's outer wall."""
-    jet, radius = triple_mean_jet(shape, points), radius / float(shape.scale)
+    jet = triple_mean_jet(shape, points)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
     normal, normal_jacobian = jet.normals[:, None], jet.normal_jacobian[:, None]
-    ring = points[:, None] + radius * around  # (b, k, f, 3)
+    ring = points[:, None] + spread(radius, around) * around  # (b, k, f, 3)
     # The ring turns with the normal at its centre.
-    ring_by_point = identity - radius * normal[..., :, None] * (around[..., None, :] @ normal_jacobian)
+    turned = around[..., None, :] @ normal_jacobian
+    ring_by_point = identity - spread(radius, turned) * normal[..., :, None] * turned
     there = triple_mean_jet(shape, ring.flatten(0, 1))
     difference = there.normals.view_as(ring) - normal
     chord = torch.linalg.vector_norm(difference, dim=-1)
@@ -110,16 +111,17 @@ def _wall_constraint(shape: Shape, points: Vectors, flatness: float, radius: flo
     change = there.normal_jacobian.view(*ring.shape, 3) @ ring_by_point - normal_jacobian
     slope = (direction[..., None, :] @ change)[..., 0, :]
     own = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
-    by_points = torch.einsum("bkij,il->bkilj", radius * slope, own).flatten(3).flatten(1, 2)
-    value = radius * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)
+    by_points = torch.einsum("bkij,il->bkilj", spread(radius, slope) * slope, own).flatten(3).flatten(1, 2)
+    value = spread(radius, points[:, 0]) * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)
     return FlatnessConstraint(value, by_points, points)
 
 
 ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far above rounding
 
 
-def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> ContactPlan:
+def check_feasibility(shape: Shape, problem: ContactProblem, points: Vectors) -> ContactPlan:
     """Check contact sets at normalised `points`; return them as a plan, with each set's first violated constraint."""
+    spec, scale = problem.spec, shape.scale
     jet = triple_jet(shape, points)
     normals, metres = jet.normals, shape.metres(points)
     wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
@@ -131,11 +133,10 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> Conta
     closed = finite & (residual <= BALANCED) & (coefficients.amin(-1) >= MIN_MARGIN)
     closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not finite is False
 
-    problem = ContactProblem.of(shape, spec)
-    apart = torch.linalg.vector_norm(problem.sides(points, normals), dim=-1).amin(-1) * shape.scale
+    apart = torch.linalg.vector_norm(problem.sides(points, normals), dim=-1).amin(-1) * scale
     room = problem.room(points, normals)
     good = {
-        Status.OUT_OF_DOMAIN: (torch.linalg.vector_norm(points, dim=-1) <= shape.domain_radius).all(-1),
+        Status.OUT_OF_DOMAIN: torch.linalg.vector_norm(points, dim=-1).amax(-1) <= shape.domain_radius,
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
         Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
         Status.BELOW_TABLE: (room >= 0).all(-1),
@@ -145,12 +146,14 @@ def check_feasibility(shape: Shape, spec: ContactSpec, points: Vectors) -> Conta
     if spec.flatness is not None:
         # A ring costs eight evaluations a contact, so it is measured only where nothing has failed before.
         rows = torch.nonzero(torch.stack(list(good.values())).all(0))[:, 0]
-        flat_rows = normal_variation(shape, points[rows], normals[rows], spec.ring_radius).amax(-1) <= spec.flatness
+        ring = problem.rows(rows).ring
+        flat_rows = normal_variation(rows_of(shape, rows), points[rows], normals[rows], ring).amax(-1) <= spec.flatness
         good[Status.NOT_FLAT] = torch.ones_like(closed).index_put((rows,), flat_rows)
     good[Status.NOT_CLOSED] = closed
-    std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
+    deviation = surface_deviation(jet.variance, jet.gradient)
+    std_m = spread(shape.std_factor * scale, deviation) * deviation
     contacts, phi = Contacts(metres, normals, jet.variance, std_m), coefficients.unflatten(1, wrench.shape[1:3])
-    quality = torch.linalg.vector_norm(points.mean(1), dim=-1) * shape.scale
+    quality = torch.linalg.vector_norm(points.mean(1), dim=-1) * scale
     return ContactPlan(contacts, phi, quality, first_violation(good))
 
 

@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, map_tensors
-from torchgrasp.geometry.plane import Plane
+from torchgrasp.base import Batch, map_tensors, spread
 from torchgrasp.plan.closure import Vectors
+from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.values import MeanJet, SurfaceJet
 from torchgrasp.specs import ContactSpec
 
@@ -29,12 +29,17 @@ CONE_MARGIN = 0.02  # the cosine between force and inward normal exceeds that of
 LEAST_SIDE = 0.05  # least distance of two tip centres, normalised: wrenches of coincident tips lack rank
 
 
+PerRow = float | Float[Tensor, "b"]
+"""A number, or one number for each row."""
+
+
 @runtime_checkable
 class Shape(Protocol):
     """The interface of a shape with uncertainty: a `ShapeGP`, or another implicit surface.
 
     `scale` [m] is the length of one normalised unit, `domain_radius` (normalised) the radius in which the shape is
     known, and `std_factor` multiplies standard deviations. `jet` gives signed distance, variance and derivatives.
+    A `ShapeBatch` has these numbers for each row.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> shape = fit_shape(load_object("jug").view)
@@ -43,11 +48,11 @@ class Shape(Protocol):
     """
 
     @property
-    def scale(self) -> float: ...  # noqa: D102
+    def scale(self) -> PerRow: ...  # noqa: D102
     @property
-    def domain_radius(self) -> float: ...  # noqa: D102
+    def domain_radius(self) -> PerRow: ...  # noqa: D102
     @property
-    def std_factor(self) -> float: ...  # noqa: D102
+    def std_factor(self) -> PerRow: ...  # noqa: D102
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet: ...  # noqa: D102
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...  # noqa: D102
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
@@ -60,6 +65,11 @@ AnyShape = TypeVar("AnyShape", bound=Shape)
 def device_of(shape: Shape) -> torch.device:
     """Return the device of a shape; the CPU if it has none."""
     return getattr(shape, "device", torch.device("cpu"))
+
+
+def rows_of(shape: AnyShape, rows: Int[Tensor, "k"]) -> AnyShape:
+    """Return the shapes of some rows; a single shape is the shape of all rows."""
+    return shape.rows(rows) if isinstance(shape, ShapeBatch) else shape  # pyright: ignore[reportReturnType]
 
 
 def walls_of(shape: AnyShape) -> tuple[AnyShape, ...]:
@@ -147,41 +157,56 @@ Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]  # values that shou
 
 @dataclasses.dataclass(frozen=True)
 class ContactProblem:
-    """The contact planning problem, Eqs. (10)-(14) of the paper, in the normalised units of one shape.
+    """The contact planning problem, Eqs. (10)-(14) of the paper, in the normalised units of one shape, or of each row.
 
     `friction` is the coefficient of the largest round cone inside the friction cone with flat sides that `certify`
-    uses. `separation` is the least distance of two fingertip centres.
+    uses. `separation` is the least distance of two fingertip centres, `ring` the radius within which the surface is
+    flat. The table has the normal `up` and the distance `floor` from the origin.
     """
 
-    fingertips: int
+    spec: ContactSpec
     friction: float
-    max_variance: float
-    domain_radius: float
-    separation: float
-    table: Plane | None
-    tip_radius: float
+    domain_radius: PerRow
+    separation: PerRow
+    tip_radius: PerRow
+    ring: PerRow
+    up: Float[Tensor, "3"] | None
+    floor: PerRow
 
     @classmethod
-    def of(cls, shape: Shape, spec: ContactSpec) -> "ContactProblem":
-        """Return the problem of a shape and a contact specification."""
-        table, scale = spec.plane, float(shape.scale)
+    def of(cls, shape: Shape, spec: ContactSpec, ring_radius: PerRow | None = None) -> "ContactProblem":
+        """Return the problem of a shape and a contact specification; `ring_radius` [m] is by default the spec's."""
+        table, up, floor = spec.plane, None, 0.0
+        scale, radius = (x if isinstance(x, Tensor) else float(x) for x in (shape.scale, shape.domain_radius))
         if table is not None:
-            foot = table.offset * table.normal
-            table = Plane(table.normal, float(shape.normalise(foot) @ table.normal)).to(device_of(shape))
-        friction, tip_radius = spec.planned_friction * math.cos(math.pi / spec.edges), spec.fingertip_radius / scale
-        radius, separation = float(shape.domain_radius), max(spec.least_separation / scale, LEAST_SIDE)
-        return cls(spec.fingertips, friction, spec.max_variance, radius, separation, table, tip_radius)
+            up, foot = table.normal.to(device_of(shape)), table.offset * table.normal
+            if isinstance(scale, Tensor):
+                floor = shape.normalise(foot.to(scale).expand(len(scale), 3)) @ up
+            else:
+                floor = float(shape.normalise(foot) @ table.normal)
+        separation = spec.least_separation / scale
+        separation = separation.clamp_min(LEAST_SIDE) if isinstance(separation, Tensor) else max(separation, LEAST_SIDE)
+        ring = (spec.ring_radius if ring_radius is None else ring_radius) / scale
+        friction = spec.planned_friction * math.cos(math.pi / spec.edges)
+        return cls(spec, friction, radius, separation, spec.fingertip_radius / scale, ring, up, floor)
+
+    def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
+        """Return the problems of some of the rows."""
+        names = [name for name in ("domain_radius", "separation", "tip_radius", "ring", "floor")]
+        own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
+        return dataclasses.replace(self, **own) if own else self
 
     def room(self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return how high (normalised) each contact is above the height at which its round tip touches the table."""
-        if self.table is None:
+        if self.up is None:
             return torch.full_like(points[..., 0], math.inf)
-        slant = 1 - normals @ self.table.normal.to(normals)
-        return self.table.height(points) - self.tip_radius * slant
+        up = self.up.to(points)
+        height, slant = points @ up, 1 - normals @ up
+        return height - spread(self.floor, height) - spread(self.tip_radius, slant) * slant
 
     def sides(self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p 3"]:
         """Return the vectors (normalised) from the first to the second fingertip centre of each pair of contacts."""
-        centres = points + self.tip_radius * normals
+        centres = points + spread(self.tip_radius, normals) * normals
         first, second = contact_pairs(points.shape[-2], points.device)
         return centres[..., second, :] - centres[..., first, :]
 
@@ -191,20 +216,26 @@ class ContactProblem:
         unknowns = 3 * f + tension.shape[1]
         own = functools.partial(_by_own_point, unknowns=unknowns)
         identity = torch.eye(3, dtype=points.dtype, device=points.device)
-        threshold, ball = self.max_variance * INSIDE, self.domain_radius * INSIDE
+        threshold, ball = self.spec.max_variance * INSIDE, self.domain_radius * INSIDE
+        edge = spread(ball, tension)
         half_slope = 2 * threshold**0.5  # slope of the variance at the threshold, for a linear standard deviation
-        centre_by_point = identity + self.tip_radius * jet.normal_jacobian
+        centre_by_point = identity + spread(self.tip_radius, jet.normal_jacobian) * jet.normal_jacobian
         cones, cones_by_x = self._cones(points, tension, jet)
         distances, distances_by_x = self._distances(points, jet.normals, centre_by_point)
         values = [
             cones,
             (jet.variance - threshold) / half_slope,
-            ((points * points).sum(-1) - ball**2) / (2 * ball),
+            ((points * points).sum(-1) - edge**2) / (2 * edge),
             distances,
         ]
-        jacobians = [cones_by_x, own(jet.variance_gradient / half_slope), own(points / ball), distances_by_x]
-        if self.table is not None:
-            up = self.table.normal.to(points)
+        jacobians = [
+            cones_by_x,
+            own(jet.variance_gradient / half_slope),
+            own(points / spread(ball, points)),
+            distances_by_x,
+        ]
+        if self.up is not None:
+            up = self.up.to(points)
             values.append((1 - INSIDE) * 0.1 - self.room(points, jet.normals))
             jacobians.append(own(-(up @ centre_by_point)))
         centre_by_x = torch.cat([identity.repeat(1, f) / f, identity.new_zeros(3, tension.shape[1])], 1)
@@ -222,7 +253,7 @@ class ContactProblem:
         blocks[:, pair, first] = (along @ centre_by_point[:, first])[..., 0, :]
         blocks[:, pair, second] = -(along @ centre_by_point[:, second])[..., 0, :]
         by_tension = points.new_zeros(len(points), len(pair), len(pair))
-        return self.separation / INSIDE - length, torch.cat([blocks.flatten(2), by_tension], 2)
+        return spread(self.separation / INSIDE, length) - length, torch.cat([blocks.flatten(2), by_tension], 2)
 
     def _cones(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Bounds:
         """Return by how much each force is outside its friction cone, as a difference of cosines, with derivatives."""

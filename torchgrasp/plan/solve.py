@@ -1,8 +1,7 @@
 """The contact planner: solves Eqs. (10)-(14) on an uncertain shape, from many initial guesses at once."""
 
-import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float
@@ -13,9 +12,9 @@ from torchgrasp.checks import Count, Positive, Seed, checked
 from torchgrasp.errors import Status
 from torchgrasp.plan.closure import Vectors
 from torchgrasp.plan.feasibility import check_feasibility
-from torchgrasp.plan.problem import ContactProblem, Shape
+from torchgrasp.plan.problem import ContactProblem, Shape, rows_of
 from torchgrasp.plan.solver import FINISH, Stage, descend, project, start_state
-from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, given_starts, settle_flatness
+from torchgrasp.plan.starts import check_starts, chunk_sizes, drawn_starts, given_starts, settle_flatness
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import ContactPlan
@@ -63,23 +62,16 @@ def plan_contacts(
     if isinstance(starts, Tensor):
         stages, firsts = SEARCH, given_starts(shape, starts)
     else:
-        stages, firsts = _stages(settled.spec), drawn_starts(shape, settled, chunk_sizes(starts), seed)
+        stages, firsts = stages_for(settled.spec), drawn_starts(shape, settled, chunk_sizes(starts), seed)
     if time_budget is not None:
         firsts = _within(time_budget, firsts)
-    return join([plan_chunk(shape, settled.spec, first, stages) for first in firsts])
+    problem = ContactProblem.of(shape, settled.spec)
+    return join([plan_chunk(shape, problem, first, stages) for first in firsts])
 
 
-def _stages(spec: ContactSpec) -> tuple[Stage, ...]:
+def stages_for(spec: ContactSpec) -> tuple[Stage, ...]:
     """Return the solver stages for random initial guesses; they depend on whether contacts must be flat."""
     return SEARCH if spec.flatness is None else TO_CENTRE
-
-
-def plan_in_turn(shape: Shape, settled: Settled, sizes: Sequence[int], seed: int) -> Iterator[ContactPlan]:
-    """Yield one plan after another; plan k comes from `sizes[k]` new initial guesses."""
-    chunks, spec = [chunk_sizes(size) for size in sizes], settled.spec
-    starts = drawn_starts(shape, settled, itertools.chain(*chunks), seed)
-    for parts in chunks:
-        yield join([plan_chunk(shape, spec, next(starts), _stages(spec)) for _ in parts])
 
 
 def _within(seconds: float, firsts: Iterator[Vectors]) -> Iterator[Vectors]:
@@ -96,13 +88,12 @@ def _within(seconds: float, firsts: Iterator[Vectors]) -> Iterator[Vectors]:
             done, first = done + len(first[:fits]), first[fits:]
 
 
-def plan_chunk(shape: Shape, spec: ContactSpec, first: Vectors, stages: tuple[Stage, ...]) -> ContactPlan:
+def plan_chunk(shape: Shape, problem: ContactProblem, first: Vectors, stages: tuple[Stage, ...]) -> ContactPlan:
     """Return the contact plan from initial guesses on the surface, in normalised units."""
-    problem = ContactProblem.of(shape, spec)
     state = start_state(shape, first)
     for stage in (*stages, FINISH):
         state = descend(shape, problem, state, stage)
-    plan = check_feasibility(shape, spec, project(shape, state.points, steps=3))
+    plan = check_feasibility(shape, problem, project(shape, state.points, steps=3))
     failed = torch.nonzero(plan.status != Status.OK)[:, 0]
-    begun = check_feasibility(shape, spec, first[failed])
+    begun = check_feasibility(rows_of(shape, failed), problem.rows(failed), first[failed])
     return put(plan, failed, pick(begun.status == Status.OK, begun, plan[failed]))

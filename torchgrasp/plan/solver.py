@@ -19,6 +19,7 @@ from torchgrasp.plan.problem import (
     SurfaceJet,
     contact_pairs,
     forces_from_tensions,
+    rows_of,
     split_unknowns,
     triple_jet,
     triple_mean_jet,
@@ -83,7 +84,8 @@ class Descent(Problem[State, LinearConstraints]):
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
         """Evaluate the constraints and their Jacobian at a state; satisfied inequalities have weight 0."""
-        constraints = self.problem.constraints(state.points, state.tension, state.jet)
+        problem = self.problem.rows(rows)
+        constraints = problem.constraints(state.points, state.tension, state.jet)
         bounds = torch.full_like(constraints.bounds, BOUNDS)
         bounds[:, : state.points.shape[1]] = self.stage.cones
         centre = torch.full_like(constraints.centre, self.stage.centre)
@@ -91,7 +93,7 @@ class Descent(Problem[State, LinearConstraints]):
         weight = torch.cat([centre, surface, bounds * (constraints.bounds > 0)], 1)
         residual = weight * constraints.values
         cost = residual.square().sum(1) / 2
-        inside = torch.linalg.vector_norm(state.points, dim=-1).amax(-1) < self.problem.domain_radius
+        inside = torch.linalg.vector_norm(state.points, dim=-1).amax(-1) < problem.domain_radius
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside)
 
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
@@ -108,16 +110,17 @@ class Descent(Problem[State, LinearConstraints]):
         shrink = (length / LONGEST_STEP).clamp(min=1.0)
         return x / shrink[:, None], length / shrink > self.stage.settled  # NaN is not longer
 
-    def move(self, state: State, x: Step) -> State:
+    def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
         """Return the state after a step x; the contacts move along the surface."""
         by_points, by_tension = split_unknowns(x)
-        points = project(self.shape, state.points + by_points, steps=1)
+        shape = rows_of(self.shape, rows)
+        points = project(shape, state.points + by_points, steps=1)
         tension = normalise_tensions(points, state.tension + by_tension)
         if self.stage.exact:
-            return State(points, tension, triple_jet(self.shape, points))
+            return State(points, tension, triple_jet(shape, points))
         slope = state.jet.variance_gradient
         variance = state.jet.variance + (slope * (points - state.points)).sum(-1)
-        mean = triple_mean_jet(self.shape, points)
+        mean = triple_mean_jet(shape, points)
         return State(points, tension, SurfaceJet(**vars(mean), variance=variance, variance_gradient=slope))
 
     def judge(self, model: LinearConstraints, trial: LinearConstraints, x: Step, damping: Damping) -> Verdict:

@@ -88,7 +88,8 @@ def settle_flatness(shape: Shape, spec: ContactSpec, seed: int) -> Settled:
     settled, flat = spec, good
     for radius in FLAT_RADII if spec.flat_radius is None else (spec.flat_radius,):
         settled = dataclasses.replace(spec, flat_radius=radius)
-        flat = normal_variation(shape, points, normals, radius, good) < CANDIDATE_FLATNESS * spec.flatness
+        ring = radius / float(shape.scale)
+        flat = normal_variation(shape, points, normals, ring, good) < CANDIDATE_FLATNESS * spec.flatness
         if int(flat.sum()) >= spec.fingertips and radius not in (spec.flat_radius, FLAT_RADII[-1]):
             generator = torch.Generator().manual_seed(seed)
             _, closed = candidate_rows(problem, points[flat], normals[flat], SURVEYED, generator)
@@ -149,7 +150,7 @@ def candidate_rows(
 
     If too few of the drawn sets are such, the rest are any candidates.
     """
-    rows, missing, f = [], starts, problem.fingertips
+    rows, missing, f = [], starts, problem.spec.fingertips
     drawn = DRAWN_PER_START * starts, f
     for _ in range(ROUNDS):
         choice = torch.randint(len(points), drawn, generator=generator, device="cpu").to(points.device)

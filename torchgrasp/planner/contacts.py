@@ -16,7 +16,7 @@ from torchgrasp.ik.attempts import seed_costs
 from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.seeds import nearest_postures, query_mixture
 from torchgrasp.plan.certify import certify
-from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.stack import Owner, Stack, by_cloud
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
 from torchgrasp.success.loads import load_arm
 from torchgrasp.values import Certificate, ContactPlan, Contacts, IKSeeds
@@ -26,11 +26,12 @@ LIKELY = 2
 
 
 class SeededContacts(NamedTuple):
-    """Contact sets with force closure, their certificates, and initial hand postures (seeds) for each set."""
+    """Contact sets with force closure, their certificates, initial hand postures (seeds), and clouds."""
 
     contacts: Contacts
     certificate: Certificate
     seeds: IKSeeds
+    owner: Owner
 
     def select(self, rows: Int[Tensor, "k"]) -> "SeededContacts":
         """Return the contact sets with given indices, with their certificates and initial hand postures (seeds)."""
@@ -38,7 +39,7 @@ class SeededContacts(NamedTuple):
         number[rows] = torch.arange(len(rows), device=rows.device)
         seeds = self.seeds[number[self.seeds.row] >= 0]
         seeds = dataclasses.replace(seeds, row=number[seeds.row])
-        return SeededContacts(self.contacts[rows], self.certificate[rows], seeds)
+        return SeededContacts(self.contacts[rows], self.certificate[rows], seeds, self.owner[rows])
 
 
 def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
@@ -47,30 +48,45 @@ def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
     for part in parts:
         seeds.append(dataclasses.replace(part.seeds, row=part.seeds.row + first))
         first += len(part.contacts)
-    return SeededContacts(join([x.contacts for x in parts]), join([x.certificate for x in parts]), join(seeds))
+    contacts, certificate = join([x.contacts for x in parts]), join([x.certificate for x in parts])
+    return SeededContacts(contacts, certificate, join(seeds), torch.cat([x.owner for x in parts]))
 
 
-def find_contacts(problem: Problem, plan: ContactPlan, most: int, note: Callable[..., None]) -> SeededContacts:
-    """Choose at most `most` planned contact sets, far apart; return those with force closure, and hand postures.
+def find_contacts(
+    stack: Stack, plan: ContactPlan, owner: Owner, most: int, note: Callable[..., None]
+) -> SeededContacts:
+    """Choose at most `most` planned contact sets of each cloud, far apart; return the closed ones, and hand postures.
 
     In mode "paper" with ranking "variance" all sets are chosen, the most certain first. `note` is called with the
     results of the stages "plan", "certify" and "query".
     """
-    request = problem.request
+    request = stack.first.request
     note("plan", plan)
     if request.mode == "paper" and request.order == "variance":
         rows, variance = torch.nonzero(plan.status == Status.OK)[:, 0], plan.contacts.variance
         assert variance is not None
         rows = rows[torch.argsort(variance[rows].sum(1), stable=True)]
     else:
-        rows = spread_rows(plan, most)
-    contacts = plan.contacts[rows]
-    certificate = certify(contacts, problem.spec)
-    contacts, certificate = contacts[certificate.closed], certificate[certificate.closed]
+        rows = _spread(stack, plan, owner, most)
+    certificate = certify(plan.contacts[rows], stack.first.spec)
+    closed = torch.nonzero(certificate.closed)[:, 0]
+    contacts, certificate, owner = plan.contacts[rows[closed]], certificate[closed], owner[rows[closed]]
     note("certify", certificate, offered=len(rows))
-    seeds = find_seeds(problem, contacts)
+    seeds = find_seeds(stack, contacts, owner)
     note("query", seeds)
-    return SeededContacts(contacts, certificate, seeds)
+    return SeededContacts(contacts, certificate, seeds, owner)
+
+
+def _spread(stack: Stack, plan: ContactPlan, owner: Owner, most: int) -> Int[Tensor, "k"]:
+    """Return the indices of at most `most` successful contact sets of each cloud that lie far apart."""
+    if len(stack) == 1:
+        return spread_rows(plan, most)
+    solved = torch.nonzero(plan.status == Status.OK)[:, 0]
+    clouds = by_cloud(owner[solved], len(stack))
+    if max(map(len, clouds)) > most:
+        plan, solved = plan[solved].to("cpu"), solved.cpu()
+        clouds = [own[spread_rows(plan[own], most)] for own in clouds]
+    return solved[torch.cat(clouds).to(solved.device)].to(owner.device)
 
 
 @checked
@@ -83,20 +99,22 @@ def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
     return rows[farthest_points(sorted_points(plan.contacts[rows]), most, first=first).sort().values]
 
 
-def find_seeds(problem: Problem, contacts: Contacts) -> IKSeeds:
+def find_seeds(stack: Stack, contacts: Contacts, owner: Owner) -> IKSeeds:
     """Return initial hand postures near contacts: in mode "joint" random postures, else those of the learned model."""
+    problem = stack.first
     if problem.mixture is None:
-        return nearest_postures(problem.library, contacts, problem.world, reachable=problem.reachable)
+        return nearest_postures(stack.library, contacts, stack.world.rows(owner), reachable=problem.reachable)
     if problem.request.mode == "paper":
-        return query_mixture(problem.hand, contacts, problem.mixture, n_seeds=1, max_energy=PAPER_ENERGY)
-    return query_mixture(problem.hand, contacts, problem.mixture)
+        return query_mixture(stack.hand, contacts, problem.mixture, n_seeds=1, max_energy=PAPER_ENERGY)
+    return query_mixture(stack.hand, contacts, problem.mixture)
 
 
 class Pool:
     """A store of the contact sets of all batches so far; each set is taken from it at most once."""
 
-    def __init__(self) -> None:
-        self.parts, self.costs, self.taken = list[SeededContacts](), list[Tensor](), list[Tensor]()
+    def __init__(self, clouds: int) -> None:
+        self.taken = [list[Tensor]() for _ in range(clouds)]
+        self.parts, self.costs = list[SeededContacts](), list[Tensor]()
 
     def add(self, found: SeededContacts, cost: Float[Tensor, "n"]) -> None:
         """Add contact sets with their costs; the cost is infinite for a set without initial hand postures (seeds)."""
@@ -104,25 +122,37 @@ class Pool:
         self.costs.append(cost)
 
     def take(self, most: int) -> SeededContacts:
-        """Return at most `most` of the cheapest contact sets, far from each other and from those taken before."""
+        """Return at most `most` of each cloud's cheapest contact sets, far from each other and from earlier ones."""
         found = join_seeded(self.parts)
-        points = sorted_points(found.contacts)
-        before = torch.cat(self.taken) if self.taken else points.new_zeros(0, dtype=torch.long)
-        cost = torch.cat(self.costs).index_fill(0, before, torch.inf)
-        likely = torch.argsort(cost, stable=True)[: min(LIKELY * most, int(torch.isfinite(cost).sum()))]
-        rows = likely[farthest_points(points[likely], most, before=points[before])].sort().values
-        self.taken.append(rows)
-        return found.select(rows)
+        clouds = by_cloud(found.owner, len(self.taken))
+        points, costs = sorted_points(found.contacts), torch.cat(self.costs)
+        if len(clouds) > 1:  # the choice runs on the host
+            points, costs = points.cpu(), costs.cpu()
+        rows = [
+            own[_choose(points[own], costs[own], taken, most)] for own, taken in zip(clouds, self.taken, strict=True)
+        ]
+        return found.select(torch.cat(rows).to(found.owner.device))
 
 
-def contact_costs(problem: Problem, found: SeededContacts) -> Float[Tensor, "b"]:
+def _choose(points: Float[Tensor, "n d"], cost: Float[Tensor, "n"], taken: list[Tensor], most: int) -> Int[Tensor, "k"]:
+    """Return at most `most` of the cheapest contact sets of one cloud; add them to those `taken` before."""
+    before = torch.cat(taken) if taken else points.new_zeros(0, dtype=torch.long)
+    cost = cost.index_fill(0, before, torch.inf)
+    likely = torch.argsort(cost, stable=True)[: min(LIKELY * most, int(torch.isfinite(cost).sum()))]
+    rows = likely[farthest_points(points[likely], most, before=points[before])].sort().values
+    taken.append(rows)
+    return rows
+
+
+def contact_costs(stack: Stack, found: SeededContacts) -> Float[Tensor, "b"]:
     """Return one cost per contact set: large if its first two hand postures miss it, or the load has a long arm."""
-    contacts, certificate, seeds = found
+    contacts, certificate, seeds, owner = found
     first = seeds[rank_in_group(seeds.row) < 2]
-    residual = seed_costs(problem.reach(contacts, certificate), first)
+    residual = seed_costs(stack.reach(contacts, certificate, owner), first)
     least = torch.full((len(contacts),), torch.inf, dtype=residual.dtype, device=residual.device)
     least = least.scatter_reduce(0, first.row, residual, "amin")
-    return least.clamp_min(1e-3).log() + 0.3 * (load_arm(contacts.points, problem.center) + 0.1).log()
+    arm = load_arm(contacts.points, stack.body.rows(owner).center)
+    return least.clamp_min(1e-3).log() + 0.3 * (arm + 0.1).log()
 
 
 def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:

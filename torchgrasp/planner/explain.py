@@ -18,9 +18,10 @@ from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.batches import Planner, rank_together
 from torchgrasp.planner.changes import Change, list_changes, more_starts
-from torchgrasp.planner.grasps import expected_success
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.request import Observer, Request, ignore
+from torchgrasp.planner.run import expected_success
+from torchgrasp.planner.stack import Stack
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
@@ -267,7 +268,7 @@ def try_request(
         specs = list(problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max())))[-1:]
         relaxed = (problem.replace("flat", given_spec=spec, descends=True) for spec in specs)
         for tried in itertools.chain((problem,), relaxed):
-            grasps = rank_together(list(Planner(tried).run(math.inf)), request.order)
+            grasps = rank_together([batch for (batch,) in Planner(Stack.of([tried])).run(math.inf)], request.order)
             funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
             if not found:
                 first("funnel", str(funnel.worst), funnel)

@@ -1,32 +1,20 @@
 """The planner's entry points: from a point cloud or a scene to ranked grasps, all at once or batch by batch."""
 
-import dataclasses
-import math
-import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Annotated, Any, overload
+from typing import Annotated, overload
 
-import numpy as np
-import torch
 from typing_extensions import Unpack
 
-from torchgrasp.base import count_status
 from torchgrasp.checks import Count, Range, Seed, checked
-from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
-from torchgrasp.files import temporary_folder
-from torchgrasp.hand.hand import Hand, HandSource
-from torchgrasp.hand.load import load_hand
-from torchgrasp.jobs import run_tasks
-from torchgrasp.planner.batches import describe, plan_hand, rank_together
-from torchgrasp.planner.problem import Problem
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.hand import Hand
+from torchgrasp.planner.many import plan_many
 from torchgrasp.planner.request import Budget, PlanOptions, Request
+from torchgrasp.planner.run import plan_request, stream_request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
-from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud, load_grasps
-
-BEST = 20  # best grasps of a set of fingers by which the set is judged: the number that an evaluation tries of a view
+from torchgrasp.values import Grasps, PointCloud
 
 
 @overload
@@ -78,8 +66,8 @@ def plan_grasps(
 
     Args:
         cloud: points that a camera saw [m]; missing normals and viewpoint are estimated. Or a `Scene` with a target. A
-            sequence of clouds gives a list of results. A bad cloud gives no grasps, and `meta["refused"]` holds the
-            reason.
+            sequence of clouds gives a list of results; on a GPU the clouds are planned at once. A bad cloud gives no
+            grasps, and `meta["refused"]` holds the reason.
         hand: from `load_hand`; it is moved to the device of the cloud.
         spec: the constraints on contacts; by default `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
@@ -114,10 +102,10 @@ def plan_grasps(
     """
     given = {"hand": hand, "spec": spec, "starts": starts, "seed": seed, "time_budget": time_budget, **options}
     if isinstance(cloud, Sequence):
-        return _plan_many(cloud, workers, given)
+        return plan_many(cloud, workers, given)
     if workers:
         raise BadArgument("workers", workers, "0 for a single cloud")
-    return _plan(Request(cloud, **given))
+    return plan_request(Request(cloud, **given))
 
 
 @checked
@@ -150,151 +138,4 @@ def stream_grasps(
     >>> bool((first.status == 0).all())
     True
     """
-    return _stream(Request(cloud, hand, spec, starts, seed, **options))
-
-
-def _plan(request: Request) -> Grasps:
-    """Plan all batches; return their executable grasps, best first, and then the failed grasps."""
-    return _finish(request, list(_plan_batches(request)))
-
-
-def _stream(request: Request) -> Iterator[Grasps]:
-    """Plan in batches; yield the executable grasps of each batch that has any, the best grasp first."""
-    batches = list[Grasps]()
-    for grasps in _plan_batches(request):
-        batches.append(grasps)
-        good = grasps[grasps.status == Status.OK]
-        if len(good):
-            yield good
-    _finish(request, batches)
-
-
-def _finish(request: Request, batches: list[Grasps]) -> Grasps:
-    """Rank the grasps of all batches together, report them to the observer, and return them."""
-    grasps = rank_together(batches, request.order)
-    request.observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
-    return grasps
-
-
-def _plan_batches(request: Request) -> Iterator[Grasps]:
-    """Yield the grasps of each batch in the frame of the request; several sets of fingers give a single batch."""
-    deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
-    hands = request.hands
-    problem = Problem.of(request, hands[0])
-    if len(hands) == 1:
-        for grasps in plan_hand(problem, deadline):
-            yield problem.give_back(grasps)
-    else:
-        yield _plan_sets(problem, hands, deadline)
-
-
-def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Grasps:
-    """Return the grasps of the set of fingers whose expected success is greatest.
-
-    All sets share the remaining time. The observer is called with "fingers" after each set, then with the stages of the
-    best set.
-    """
-    best, observer = None, problem.request.observer
-    for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
-        stages = list[tuple[str, str, Any]]()
-        problem = problem.for_hand(hand, lambda *stage: stages.append(stage))  # noqa: B023 called at once
-        now = time.monotonic()
-        batches = list(plan_hand(problem, now + (deadline - now) / left))
-        grasps = problem.give_back(rank_together(batches, problem.request.order))
-        expected, count = expected_success(grasps), int((grasps.status == Status.OK).sum())
-        observer("fingers", f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected", grasps)
-        if best is None or expected > best[0]:
-            best = expected, grasps, stages
-    assert best is not None
-    for stage in best[2]:
-        observer(*stage)
-    return best[1]
-
-
-def expected_success(grasps: Grasps, best: int = BEST) -> float:
-    """Return the mean predicted success of the `best` best executable grasps; 0 for each grasp that is missing."""
-    likely = torch.where(grasps.status == Status.OK, torch.sigmoid(grasps.score), 0.0)
-    return float(likely.sort(descending=True).values[:best].sum()) / best
-
-
-def _plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:
-    """Plan for each cloud on its device; a bad cloud does not affect the others.
-
-    `given` holds the other arguments of `Request`, common to all clouds. A worker process gives up a cloud after an
-    hour.
-    """
-    for name in ("shape", "observer", "reachable"):
-        if given.get(name) is not None:
-            raise BadArgument(name, "one for many clouds", "None for many clouds")
-    for cloud in clouds:
-        _ = Request(cloud, **given).hands  # wrong fingers are refused
-    if not workers:
-        planned = [_plan_or_refuse(Request(cloud, **given)) for cloud in clouds]
-    else:
-        hand = given["hand"].source
-        source = HandSource(hand.option, hand.urdf_path, hand.sha256)
-        rest = {name: _with_arrays(value) for name, value in given.items() if name != "hand"}
-        with temporary_folder() as folder:
-            files = [folder / f"{k}.safetensors" for k in range(len(clouds))]
-            sent = [(_with_arrays(cloud), str(cloud.points.device)) for cloud in clouds]
-            tasks = [(*cloud, source, rest, file) for cloud, file in zip(sent, files, strict=True)]
-            planned = [
-                load_grasps(file) if end is None else _refused(given["hand"], end.sentence)
-                for file, end in zip(files, run_tasks(_plan_to_file, tasks, workers, 3600.0), strict=True)
-            ]
-    return [grasps.to(cloud.points.device) for cloud, grasps in zip(clouds, planned, strict=True)]
-
-
-def _plan_or_refuse(request: Request) -> Grasps:
-    """Return the grasps of a request; if its cloud is bad, return an empty set with the reason in `meta`."""
-    try:
-        return _plan(request)
-    except MissingExtra:
-        raise
-    except GraspError as error:
-        return _refused(request.hand, " ".join(str(error).split()))
-
-
-def _refused(hand: Hand, reason: str) -> Grasps:
-    """Return an empty set of grasps, whose `meta` gives the reason why planning was refused."""
-    return dataclasses.replace(no_grasps(hand), meta={"hand": hand.name, "refused": reason})
-
-
-def no_grasps(hand: Hand) -> Grasps:
-    """Return an empty set of grasps that has the joints and fingers of a hand."""
-    f = len(hand.tips)
-
-    def none(*shape: int) -> torch.Tensor:
-        return torch.zeros(0, *shape, dtype=torch.float64, device="cpu")
-
-    contacts = Contacts(none(f, 3), none(f, 3), none(f), none(f))
-    certificate = Certificate(none(), none(), none(), none().bool(), none(6))
-    return Grasps(
-        none(hand.dof), none(hand.dof), none(3), none(4, 4), contacts, none(f).long(), none(f), none(), none(f),
-        certificate, none(), none().long(), known=none().bool(), interval=none(2),
-    )  # fmt: skip
-
-
-def _plan_to_file(cloud: Any, device: str, hand: HandSource, rest: dict[str, Any], file: Path) -> None:
-    """Plan for one cloud in a worker process, and save the grasps to a file."""
-    points = _with_tensors(cloud).to(torch.device(device))
-    given = {name: _with_tensors(value) for name, value in rest.items()}
-    _plan_or_refuse(Request(points, load_hand(hand.urdf_path.parent, hand.option), **given)).save(file)
-
-
-def _with_arrays(value: Any) -> Any:
-    """Return a dataclass as a pair of its class and its fields, with tensors as NumPy arrays, for another process."""
-    if isinstance(value, torch.Tensor):
-        return value.detach().cpu().numpy()
-    if dataclasses.is_dataclass(value):
-        return type(value), {f.name: _with_arrays(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    return value
-
-
-def _with_tensors(sent: Any) -> Any:
-    """Return the value that `_with_arrays` packed, with tensors in place of the arrays."""
-    if isinstance(sent, np.ndarray):
-        return torch.from_numpy(sent)
-    if isinstance(sent, tuple) and isinstance(sent[0], type):
-        return sent[0](**{name: _with_tensors(field) for name, field in sent[1].items()})
-    return sent
+    return stream_request(Request(cloud, hand, spec, starts, seed, **options))

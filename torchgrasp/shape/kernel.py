@@ -105,7 +105,7 @@ def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[
     return [*values, slope]
 
 
-def thin_plate(r: Float[Tensor, "*s"], psi: float | Float[Tensor, ""]) -> Float[Tensor, "*s"]:
+def thin_plate(r: Float[Tensor, "*s"], psi: float | Float[Tensor, "*p"]) -> Float[Tensor, "*s"]:
     """Return 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper: it is a covariance in a ball of diameter 3/4 psi."""
     # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals need it.
     return r * r * (2.0 * r - 3.0 * psi) + psi**3
@@ -122,11 +122,11 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
     1.5
     """
     remedy = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
-    fast = closed_form and partial(_differentiate_thin_plate, psi)
+    fast = closed_form and partial(differentiate_thin_plate, psi)
     return Kernel(partial(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, fast)
 
 
-def _differentiate_thin_plate(psi: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
+def differentiate_thin_plate(psi: float | Tensor, r: Tensor, count: int) -> tuple[Tensor, ...]:
     """Return k and its derivatives by r^2 / 2 of the thin plate kernel in closed form, `count` in all."""
     values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6.0 * r).sub_(6.0 * psi)]
     if count > 2:
@@ -188,16 +188,17 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
 
 
 def cross_covariance(
-    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], n_oriented: int
+    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"], n_oriented: int
 ) -> Float[Tensor, "4 q rows"]:
     """Return the covariance of distance and gradient at x with the observations at y, Eqs. (2)-(5) of the paper.
 
     The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T with d = x - y and derivatives by r^2 / 2. The columns are the
-    distances at all y, then each gradient component at the first `n_oriented`, which have normals.
+    distances at all y, then each gradient component at the first `n_oriented`, which have normals. With a leading axis,
+    `y` holds the observations of each x.
     """
     if not (kernel.closed_form and is_plain(x, y)):
         return _differentiable_cross_covariance(kernel, x, y, n_oriented)
-    n = len(y)
+    n = y.shape[-2]
     d, r = separations(x, y)
     k, first, second = kernel.derivatives(r, 3)
     out = x.new_empty(4, len(x), n + 3 * n_oriented)
@@ -233,9 +234,12 @@ def _differentiable_cross_covariance(
     return torch.cat([with_distances, with_normals], -1)
 
 
-def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
-    """Return the three components of x - y for all pairs, and the distances |x - y|, without cancellation."""
-    d = [x[:, m, None] - y[None, :, m] for m in range(3)]
+def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
+    """Return the three components of x - y for all pairs, and the distances |x - y|, without cancellation.
+
+    With a leading axis, `y` holds the points that each x is compared with.
+    """
+    d = [x[:, m, None] - y[..., m] for m in range(3)]
     return d, (d[0] * d[0]).addcmul_(d[1], d[1]).addcmul_(d[2], d[2]).sqrt_()
 
 

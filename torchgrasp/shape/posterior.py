@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchgrasp.base import Value, in_chunks
+from torchgrasp.base import Value, at_once, in_chunks
 from torchgrasp.checks import checked, is_known
 from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.shape.jets import Weighted, distance_rows, evaluate_jet, evaluate_mean, evaluate_mean_jet
 from torchgrasp.shape.kernel import Kernel, cross_covariance, differentiate, gram, is_plain, separations
 from torchgrasp.shape.values import JointEstimate, MeanJet, SurfaceJet
 
@@ -28,15 +29,6 @@ class Posterior(Value):
     factor: Float[Tensor, "rows rows"]  # lower Cholesky factor of K + noise; rows of later observations come last
     order: Int[Tensor, "rows"] | None  # row in `weights` of each row of `factor`; None if the same
     kernel: Kernel
-
-    @cached_property
-    def precision(self) -> Float[Tensor, "rows rows"]:
-        """The inverse covariance (K + noise)^-1 of all observations, in the order of `weights`."""
-        inverse = torch.cholesky_inverse(self.factor)
-        if self.order is None:
-            return inverse
-        back = torch.argsort(self.order)
-        return inverse[back][:, back]
 
     @cached_property
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
@@ -62,7 +54,7 @@ class Posterior(Value):
         """Return the mean signed distance at normalised points."""
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
-        return in_chunks(lambda part: self._evaluate_mean(part, gradient=False), x, 2048)[0]
+        return in_chunks(lambda part: evaluate_mean(self.weighted, part, gradient=False), x, 2048)[0]
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
@@ -70,23 +62,8 @@ class Posterior(Value):
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
             return distance, torch.stack(slope, -1)
-        size = 512 if x.device.type == "cpu" else 16384
-        found = in_chunks(lambda part: self._evaluate_mean(part, gradient=True), x, size)
+        found = in_chunks(lambda part: evaluate_mean(self.weighted, part, gradient=True), x, at_once(x, 512))
         return found  # pyright: ignore[reportReturnType]
-
-    def _evaluate_mean(self, x: Float[Tensor, "q 3"], gradient: bool) -> tuple[Tensor, ...]:
-        """Return the mean distance and, if asked for, its gradient for one chunk of points."""
-        a, b = self._split_weights()
-        near = len(b)  # the points with normals come first
-        distances = torch.cdist(x, self.x, compute_mode="donot_use_mm_for_euclid_dist")
-        k, first, *second = self.kernel.derivatives(distances, 3 if gradient else 2)
-        along = x @ b.T - (self.x[:near] * b).sum(-1)
-        distance = k @ a - (first[:, :near] * along).sum(1)
-        if not gradient:
-            return (distance,)
-        c = first * a
-        c[:, :near].addcmul_(second[0][:, :near], along, value=-1.0)
-        return distance, _sum_differences(c, x, self.x) - first[:, :near] @ b
 
     @checked(gradients=True)
     def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
@@ -121,16 +98,18 @@ class Posterior(Value):
         variance, k* the covariance of the point with the data, and A the inverse covariance of the data. Its gradient
         is -2 times the gradient of a mean with the weights A k*.
         """
-        size, evaluate = 256 if x.device.type == "cpu" else 16384, _jet if self._is_plain(x) else _differentiable_jet
-        return SurfaceJet(*in_chunks(partial(evaluate, self), x, size))
+        size = at_once(x, 256)
+        if not self._is_plain(x):
+            return SurfaceJet(*in_chunks(partial(_differentiable_jet, self), x, size))
+        return SurfaceJet(*in_chunks(lambda part: evaluate_jet(self.weighted, part, self.explain), x, size))
 
     @checked(gradients=True)
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean distance with first and second derivatives at normalised points, at less cost than `jet`."""
-        size = 256 if x.device.type == "cpu" else 16384
+        size = at_once(x, 256)
         if not self._is_plain(x):
             return MeanJet(*in_chunks(partial(_differentiable_jet, self), x, size)[:3])
-        return MeanJet(*in_chunks(lambda part: _mean_jet(self, part)[0], x, size))
+        return MeanJet(*in_chunks(lambda part: evaluate_mean_jet(self.weighted, part)[0], x, size))
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
@@ -158,7 +137,7 @@ class Posterior(Value):
             return torch.cat([k, -(first[..., None] * d)[:, : self.n_oriented].mT.flatten(1)], 1)
         d, r = separations(x, self.x)
         k, first = self.kernel.derivatives(r, 2)
-        return _distance_rows(d, k, first, self.n_oriented)
+        return distance_rows(d, k, first, self.n_oriented)
 
     @checked(gradients=True)
     def whiten(self, rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
@@ -171,6 +150,20 @@ class Posterior(Value):
             return torch.linalg.solve_triangular(self.factor, rows.T, upper=False).T
         return torch.cat([rows[:, : len(block)] @ block for block in self.whiteners], 1)
 
+    @checked
+    def explain(self, rows: Float[Tensor, "q rows"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q rows"]]:
+        """Return the variance k A k that observations explain, and k A, for rows k of covariances with them.
+
+        A is the inverse covariance of the observations. With the whitened row, the variance is a sum of squares.
+        """
+        whitened, solved, first = self.whiten(rows), torch.zeros_like(rows), 0
+        for block in self.whiteners:
+            solved[:, : len(block)].addmm_(whitened[:, first : first + block.shape[1]], block.T)
+            first += block.shape[1]
+        if self.order is not None:
+            solved = torch.empty_like(solved).index_copy(1, self.order, solved)
+        return torch.linalg.vecdot(whitened, whitened), solved
+
     @checked(gradients=True)
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
         """Return the covariance of distance and gradient (d, w) at normalised points with all observations."""
@@ -180,51 +173,11 @@ class Posterior(Value):
         """Return whether torch neither differentiates points and posterior nor maps over them."""
         return is_plain(x, self.x, self.weights, self.factor)
 
-    def _split_weights(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "near 3"]]:
-        """Return the posterior weight of each observed distance and the three weights of each observed normal."""
+    @property
+    def weighted(self) -> Weighted:
+        """The observed points with the posterior weights of their distances and normals."""
         n = len(self.x)
-        return self.weights[:n], self.weights[n:].reshape(3, self.n_oriented).T
-
-
-Values = Float[Tensor, "q n"]
-Kernels = tuple[list[Tensor], Values, Values, Float[Tensor, "q near"]]
-"""Components of the differences from the observed points, k, k', and k'' for the points with normals."""
-
-
-def _mean_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
-    """Return the fields of `MeanJet` for one chunk of points, and kernel values that the variance needs."""
-    known, (a, b) = posterior.x, posterior._split_weights()
-    near = len(b)  # the points with normals come first
-    d, r = separations(x, known)
-    k, first, second, third = posterior.kernel.derivatives(r, 4)
-    near_first, near_second = first[:, :near], second[:, :near]
-    along = torch.addmm((known[:near] * b).sum(-1), x, b.T, beta=-1.0)
-    c = torch.mul(first, a)
-    c[:, :near].addcmul_(near_second, along, value=-1.0)
-    outer = second * a
-    outer[:, :near].addcmul_(third[:, :near], along, value=-1.0)
-    distance = torch.mv(k, a) - (near_first * along).sum(1)
-    gradient = _sum_differences(c, x, known) - near_first @ b
-    rows = [0.5 * _sum_differences(outer * part, x, known) - (near_second * part[:, :near]) @ b for part in d]
-    half = torch.stack(rows, 1)
-    hessian = half + half.mT
-    hessian.diagonal(dim1=1, dim2=2).add_(c.sum(1, keepdim=True))
-    return (distance, gradient, hessian), (d, k, first, near_second)
-
-
-def _jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return the fields of `SurfaceJet` for one chunk of points."""
-    mean, (d, k, first, near_second) = _mean_jet(posterior, x)
-    n, near = len(posterior.x), near_second.shape[1]
-    near_d, near_first = [part[:, :near] for part in d], first[:, :near]
-    solved = _distance_rows(d, k, first, near) @ posterior.precision
-    s, u = solved[:, :n], solved[:, n:].unflatten(1, (3, near)).unbind(1)
-    along = (near_d[0] * u[0]).addcmul_(near_d[1], u[1]).addcmul_(near_d[2], u[2])
-    variance = posterior.kernel.profile(x.new_zeros(())) - (k * s).sum(1) + (near_first * along).sum(1)
-    c = first * s
-    c[:, :near].addcmul_(near_second, along, value=-1.0)
-    explained = _sum_differences(c, x, posterior.x) - torch.stack([(near_first * part).sum(1) for part in u], 1)
-    return *mean, variance, -2.0 * explained
+        return Weighted(self.x, self.weights[:n], self.weights[n:].reshape(3, self.n_oriented).T, self.kernel)
 
 
 def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, ...]:
@@ -236,16 +189,6 @@ def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[
 
     (hessian, slope), (distance, gradient, variance) = torch.func.jacrev(total, has_aux=True)(x)
     return distance, gradient, hessian.transpose(0, 1), variance, slope
-
-
-def _distance_rows(d: list[Tensor], k: Values, first: Values, near: int) -> Float[Tensor, "q rows"]:
-    """Return the covariance of distances with all observations: k, then -k' d for each component of the normals."""
-    return torch.cat([k, *(-(part[:, :near] * first[:, :near]) for part in d)], 1)
-
-
-def _sum_differences(c: Float[Tensor, "q n"], x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"]) -> Float[Tensor, "q 3"]:
-    """Return sum_j c_j (x - y_j) for each point x, by a matrix product."""
-    return x * c.sum(1, keepdim=True) - c @ y
 
 
 def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:

@@ -1,30 +1,52 @@
 """The object as the planner estimates it, for predictions of success."""
 
+import math
 from typing import NamedTuple
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.geometry.signed_distance import DistanceField
+from torchgrasp.plan.problem import PerRow, rows_of
+from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import collision_field, extract_mesh
 
 
 class EstimatedBody(NamedTuple):
-    """What the planner knows of an object, in an upright frame, whose z axis points up.
+    """What the planner knows of an object, in an upright frame, whose z axis points up; or of the object of each row.
 
     Args:
         shape: the posterior.
-        vertices: of the estimated surface [m]; their mean is taken for the centre of mass.
         field: signed distances from the estimated surface.
+        center: the mean [m] of the surface's vertices, which is taken for the centre of mass.
+        size: half the size [m]: the length of a normalised unit.
+        height, breadth: extent [m] along z, and lesser deviation [m] of the vertices in the plane across z.
     """
 
-    shape: ShapeGP
-    vertices: Float[Tensor, "v 3"]
-    field: SignedDistanceField
+    shape: ShapeGP | ShapeBatch
+    field: DistanceField
+    center: Float[Tensor, "*b 3"]
+    size: PerRow
+    height: PerRow
+    breadth: PerRow
 
     @classmethod
     def of(cls, shape: ShapeGP) -> "EstimatedBody":
         """Return the body of a shape in an upright frame."""
         mesh = extract_mesh(shape)
-        return cls(shape, mesh.vertices, collision_field(shape, mesh))
+        return cls.around(shape, mesh.vertices, collision_field(shape, mesh))
+
+    @classmethod
+    def around(cls, shape: ShapeGP, vertices: Float[Tensor, "v 3"], field: DistanceField) -> "EstimatedBody":
+        """Return the body of a shape with the given vertices [m] of its surface, and distances from the surface."""
+        center, rise = vertices.mean(0), vertices[:, 2].amax() - vertices[:, 2].amin()
+        deviations = torch.linalg.svdvals(vertices[:, :2] - center[:2]) / math.sqrt(len(vertices))
+        return cls(shape, field, center, shape.scale, float(rise), float(deviations[1]))
+
+    def rows(self, index: Int[Tensor, "k"]) -> "EstimatedBody":
+        """Return the bodies of some of the rows; a single body is that of all rows."""
+        numbers = (x[index] if isinstance(x, Tensor) and x.ndim else x for x in (self.size, self.height, self.breadth))
+        center = self.center if self.center.ndim == 1 else self.center[index]
+        return EstimatedBody(rows_of(self.shape, index), self.field.rows(index), center, *numbers)

@@ -1,15 +1,16 @@
 """What decides whether a grasp holds its task: numbers that physics names, one column each, in SI units."""
 
-import math
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.base import spread
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.forces import least_friction_forces
+from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.loads import carrying_force, greatest_force
@@ -38,23 +39,21 @@ def measure_grasps(
 ) -> Float[Tensor, "g k"]:
     """Return the `FEATURES` of each grasp for a task, at the friction coefficient `friction`.
 
-    Body and grasps are in an upright frame. `lifted` tells whether the task is a lift or pulls. A force to spare is the
-    logarithm of the fingers' strength over the force needed. "force needed", "force to spare" and "slippery" are at
-    half the friction.
+    Body and grasps are in an upright frame; `body` may be that of each grasp. `lifted` tells whether the task is a lift
+    or pulls. A force to spare is the logarithm of the fingers' strength over the force needed. "force needed", "force
+    to spare" and "slippery" are at half the friction.
     """
-    shape, vertices = body.shape, body.vertices
-    contacts, g = grasps.contacts, len(grasps)
-    points, normals = contacts.points.to(shape.x), contacts.normals.to(shape.x)
-    center, low, high = vertices.mean(0), vertices.amin(0), vertices.amax(0)
+    contacts, g, center = grasps.contacts, len(grasps), body.center
+    points, normals = contacts.points.to(center), contacts.normals.to(center)
     forces, pressing = least_friction_forces(points, normals, strongest=1.0), task.pressing(lifted)
     greatest = greatest_force(hand, grasps, forces).to(points).nan_to_num(0.0)
     strength = torch.minimum(greatest, greatest.new_tensor(pressing or GRIP))
     needed = _force_for(contacts, forces, center, (0.5 * friction,), task.mass, lifted)[0]
     moved = touch_moved(hand, body.field, grasps, forces)
-    there = _force_for(moved.contacts, moved.forces, center, (friction, 0.5 * friction), task.mass, lifted)
+    everywhere = center if center.ndim == 1 else center.repeat(len(moved.touched), 1)
+    there = _force_for(moved.contacts, moved.forces, everywhere, (friction, 0.5 * friction), task.mass, lifted)
     there = there.unflatten(1, moved.touched.shape).where(moved.touched, 1e3)
     spare, slippery = torch.log(strength.clamp_min(1e-3) / there)
-    spread = torch.linalg.svdvals(vertices[:, :2] - center[:2]) / math.sqrt(len(vertices))
     found: dict[str, Tensor | float] = {
         "force needed": needed,
         "force to spare": torch.log(strength.clamp_min(1e-3) / needed),
@@ -63,10 +62,10 @@ def measure_grasps(
         "force to spare if moved and slippery": slippery.clamp(-2.0, 2.0).mean(0),
         "carried if moved": (spare > 0).to(points).mean(0),
         "deviation": contacts.require_std().to(points).amax(1),
-        "tilt": _normal_deviation(shape, points).amax(1),
-        "size": shape.scale,
-        "height": float(high[2] - low[2]),
-        "breadth": float(spread[1]),
+        "tilt": _normal_deviation(body.shape, points).amax(1),
+        "size": body.size,
+        "height": body.height,
+        "breadth": body.breadth,
         "friction": friction,
         "mass": task.mass,
         "force": pressing,
@@ -80,7 +79,7 @@ def measure_grasps(
 
 
 def _force_for(
-    contacts: Contacts, forces: Float[Tensor, "g f 3"], center: Float[Tensor, "3"], frictions: Sequence[float],
+    contacts: Contacts, forces: Float[Tensor, "g f 3"], center: Float[Tensor, "*b 3"], frictions: Sequence[float],
     mass: float, lifted: bool,
 ) -> Float[Tensor, "m g"]:  # fmt: skip
     """Return the force [N] of the strongest finger with which no contact slides under the load, for each friction."""
@@ -89,10 +88,11 @@ def _force_for(
     return carrying_force(contacts, forces, center, frictions, load, pull).clamp(1e-3, 1e3)  # infinite: no force does
 
 
-def _normal_deviation(shape: ShapeGP, points: Float[Tensor, "g f 3"]) -> Float[Tensor, "g f"]:
+def _normal_deviation(shape: ShapeGP | ShapeBatch, points: Float[Tensor, "g f 3"]) -> Float[Tensor, "g f"]:
     """Return the standard deviation [rad] of the surface's normal at each contact, about the axis of largest one."""
-    mean, spread = shape.estimate(shape.normalise(points).flatten(0, 1))
+    mean, covariance = shape.estimate(shape.normalise(points).flatten(0, 1))
     normal, slope = unit(mean[:, 1:]), torch.linalg.vector_norm(mean[:, 1:], dim=-1)
     across = torch.eye(3).to(normal) - normal[:, :, None] * normal[:, None]
-    largest = torch.linalg.eigvalsh(across @ spread[:, 1:, 1:] @ across)[:, -1].clamp_min(0).sqrt()
-    return (shape.std_factor * largest / slope).view(points.shape[:2])
+    largest = torch.linalg.eigvalsh(across @ covariance[:, 1:, 1:] @ across)[:, -1].clamp_min(0).sqrt()
+    largest, slope = (x.view(points.shape[:2]) for x in (largest, slope))
+    return spread(shape.std_factor, largest) * largest / slope

@@ -17,7 +17,7 @@ CARRYING = 2.07
 """Log-odds of success that a lift loses for each factor e on the force that carries the load."""
 
 
-def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "b"]:
+def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> Float[Tensor, "b"]:
     """Return the distance of `center` [m], where the load acts, from the longest side of the contacts' triangle.
 
     The distance is divided by the triangle's height over this side, about which the object turns most easily. For more
@@ -25,7 +25,8 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
     """
     if points.shape[1] > 3:
         triples = subsets(points.shape[1], 3, points.device)
-        return load_arm(points[:, triples].flatten(0, 1), center).unflatten(0, (len(points), len(triples))).amin(1)
+        each = center if center.ndim == 1 else center.repeat_interleave(len(triples), 0)
+        return load_arm(points[:, triples].flatten(0, 1), each).unflatten(0, (len(points), len(triples))).amin(1)
     sides = points.roll(-1, dims=1) - points
     longest = torch.linalg.vector_norm(sides, dim=-1).argmax(1)[:, None, None].expand(-1, 1, 3)
     along, foot = unit(sides.gather(1, longest)[:, 0]), points.gather(1, longest)[:, 0]
@@ -36,7 +37,7 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "3"]) -> Floa
 
 
 def carrying_force(
-    contacts: Contacts, forces: Float[Tensor, "b f 3"], center: Float[Tensor, "3"], frictions: Sequence[float],
+    contacts: Contacts, forces: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"], frictions: Sequence[float],
     load: Float[Tensor, "3"], push: float = 0.0,
 ) -> Float[Tensor, "m b"]:  # fmt: skip
     """Return for each of m friction coefficients the least factor s on balanced forces f_0 at which all contacts stick.

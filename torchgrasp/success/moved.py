@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import fibonacci_sphere
-from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.geometry.signed_distance import DistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.forces import forces_near, internal_forces
 from torchgrasp.values import Contacts, Grasps
@@ -27,7 +27,7 @@ class Touches(NamedTuple):
     touched: Bool[Tensor, "d g"]
 
 
-def touch_moved(hand: Hand, field: SignedDistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Touches:
+def touch_moved(hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Touches:
     """Return where the fingers touch the object if the object is displaced, by distances that a hand still finds.
 
     The displacements fill a ball of 20 mm, in the axes of the hand. Each fingertip moves on along the line from its
@@ -53,17 +53,20 @@ def touch_moved(hand: Hand, field: SignedDistanceField, grasps: Grasps, forces: 
 
 
 def trace(
-    field: SignedDistanceField, start: Sets, way: Sets, radius: Float[Tensor, "f"]
+    field: DistanceField, start: Sets, way: Sets, radius: Float[Tensor, "f"]
 ) -> tuple[Sets, Sets, Bool[Tensor, "d g f"]]:
     """Return where balls that move from `start` [m] along a `way` first touch a surface, its normals, and whether.
 
     This is sphere tracing: a ball moves on by its distance from the surface, up to 120 mm in all.
     """
     close, least, length = 3e-4, 2e-4, 0.12  # [m]: distance of a touch; least step; longest way
-    travelled = torch.zeros_like(start[..., 0])
+    travelled, shape = torch.zeros_like(start[..., 0]).flatten(0, 1), start.shape[:-1]
+    field = field.rows(torch.arange(start.shape[1], device=start.device).repeat(len(start)))
+    start, way = start.flatten(0, 1), way.flatten(0, 1)
     for _ in range(24):
         gap = field.query(start + travelled[..., None] * way)[0] - radius
         travelled = torch.where(gap < close, travelled, travelled + gap.clamp_min(least)).clamp_max(length)
     distance, gradient = field.query(start + travelled[..., None] * way)
     normals = gradient / torch.linalg.vector_norm(gradient, dim=-1, keepdim=True).clamp_min(1e-9)
-    return start + travelled[..., None] * way - distance[..., None] * normals, normals, distance - radius < close
+    points = start + travelled[..., None] * way - distance[..., None] * normals
+    return points.view(*shape, 3), normals.view(*shape, 3), (distance - radius < close).view(shape)

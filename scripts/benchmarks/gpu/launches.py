@@ -17,11 +17,9 @@ from tests.devices.elsewhere import DEVICE, pretend
 from tests.devices.launches import Launches, Place
 
 KINDS = ("launch", "read", "upload")
-PLANNED = 16
-"""Most clouds of a batch that are planned: the planner takes clouds in turn, so further ones cost the same."""
 STAGES = {
     "shape": "upright_frame remove_duplicates fit_upright extract_mesh collision_field vague",
-    "plan": "settle_flatness plan_in_turn",
+    "plan": "settle_flatness plan_chunk",
     "certify": "certify",
     "seeds": "_drawn nearest_postures query_mixture drop_unreachable contact_costs",
     "fixed contacts": "try_best_seeds",
@@ -38,16 +36,15 @@ def count_launches(o: Options) -> list[Row]:
     """Count what plans of batches of clouds ask of a GPU for each cloud."""
     hand, found = load_hand(o.hands[0]), dict[int, Launches]()
     count_plans(hand, [see(OBJECTS[0], 0)], 20)  # what a process keeps is made before
-    for size in {min(batch, PLANNED) for batch in o.batches}:
+    for size in o.batches:
         found[size] = count_plans(hand, views(size), o.starts)
-    counts = {batch: (found[min(batch, PLANNED)], min(batch, PLANNED)) for batch in o.batches}
-    rows = [batch_row(batch, *counted, hand, o.starts) for batch, counted in counts.items()]
+    rows = [batch_row(size, counted, hand, o.starts) for size, counted in found.items()]
     for stage in STAGES:
-        texts = {batch: say([n.by_stage(kind)[stage] / size for kind in KINDS]) for batch, (n, size) in counts.items()}
+        texts = {size: say([n.by_stage(kind)[stage] / size for kind in KINDS]) for size, n in found.items()}
         rows.append(
             Row(f"stage {stage}", "-", "; ".join(f"batch {b}: {x}" for b, x in texts.items()), None, {"batches": texts})
         )
-    last, size = list(counts.values())[-1]
+    size, last = list(found.items())[-1]
     return rows + [lines_row(kind, last.most(kind, 10), size) for kind in KINDS]
 
 
@@ -69,15 +66,15 @@ def count_plans(hand: Hand, clouds: list[PointCloud], starts: int) -> Launches:
 
 def say(counts: Iterable[float]) -> str:
     """Return the numbers of launches, reads and uploads as text."""
-    return "{:.0f} launches, {:.0f} reads, {:.0f} uploads".format(*counts)
+    return "{:.0f} launches, {:.1f} reads, {:.1f} uploads".format(*counts)
 
 
-def batch_row(batch: int, counted: Launches, size: int, hand: Hand, starts: int) -> Row:
-    """Return the row of a batch of clouds, of which `size` were planned."""
-    planned = "" if batch == size else f", {size} of them planned"
+def batch_row(size: int, counted: Launches, hand: Hand, starts: int) -> Row:
+    """Return the row of a batch of clouds that are planned at once."""
     each = {kind: counted.total(kind) / size for kind in KINDS}
-    what = f"{batch} clouds in turn{planned}; {hand.name}, {starts} starts; for each cloud"
-    return Row(what, "-", say(each.values()), None, {"batch": batch, "planned": size, **each})
+    return Row(
+        f"{size} clouds at once; {hand.name}, {starts} starts; for each cloud", "-", say(each.values()), None, each
+    )
 
 
 def lines_row(kind: str, lines: list[tuple[Place, int]], size: int) -> Row:

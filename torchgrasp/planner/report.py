@@ -1,0 +1,75 @@
+"""What the planner tells an observer: each stage once, with the results of all batches, and the end of each batch."""
+
+import dataclasses
+from typing import Any
+
+import torch
+
+from torchgrasp.base import count_status, join
+from torchgrasp.errors import Status
+from torchgrasp.ik.attempts import executable
+from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.request import ignore
+from torchgrasp.shape.values import surface_deviation
+from torchgrasp.values import Grasps, format_success
+
+
+class Report:
+    """Reports progress to the observer: each stage once with the results of all batches, and the end of each batch."""
+
+    def __init__(self, problem: Problem, batches: int, planned: int) -> None:
+        """Take the number of all `batches`, and the number `planned` of those batches that plan new initial guesses."""
+        self.problem, self.batches, self.planned = problem, batches, planned
+        self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
+        self.ended = self.offered = self.closed = 0
+
+    def shape(self) -> None:
+        """Report the estimated shape, and the fraction of its surface with a standard deviation below 4 mm."""
+        if self.problem.request.observer is ignore:
+            return
+        shape, vertices = self.problem.shape, self.problem.surface.vertices
+        jet = shape.jet(shape.normalise(vertices[:: len(vertices) // 500 + 1]))
+        std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
+        certain = float((std_m < 0.004).double().mean())
+        self.problem.tell("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
+
+    def note(self, stage: str, value: Any, offered: int = 0) -> None:
+        """Store the result of one stage of one batch; `offered` is how many contact sets stage "certify" checked."""
+        if stage == "query":  # rows are counted through all batches
+            value = dataclasses.replace(value, row=value.row + self.closed - len(self.parts["certify"][-1]))
+        elif stage == "certify":
+            self.offered, self.closed = self.offered + offered, self.closed + len(value)
+        self.parts[stage].append(value)
+        if len(self.parts[stage]) == self.planned:
+            self._tell(stage)
+
+    def end_batch(self, grasps: Grasps, last: bool) -> None:
+        """Report that a batch has ended; if it is the `last` one, report the stages not yet reported, too."""
+        self.ended += 1
+        if self.ended < self.batches and self.problem.request.observer is not ignore:
+            good = int(executable(grasps).sum())
+            best = f", the best {format_success(grasps)} likely" if good else ""
+            text = f"{self.ended} of {self.batches}: {good} executable of {len(grasps)}{best}"
+            self.problem.tell("batch", text, grasps)
+        if last and len(self.parts["plan"]) < self.planned:
+            for stage in self.parts:
+                self._tell(stage)
+
+    def _tell(self, stage: str) -> None:
+        """Report to the observer the results of one stage, from all batches so far."""
+        if self.problem.request.observer is ignore:
+            return
+        value = join(self.parts[stage])
+        if stage == "plan":
+            text = f"{len(value)} starts: {describe(count_status(value.status))}"
+        elif stage == "certify":
+            text = f"{self.closed} of {self.offered} closed at friction {self.problem.spec.planned_friction:g}"
+        else:
+            text = f"{len(value)} seeds for {len(torch.unique(value.row))} of {self.closed} triples"
+        self.problem.tell(stage, text, value)
+
+
+def describe(counts: dict[Status, int]) -> str:
+    """Return how often each status occurs as one line of text, the successes first."""
+    ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
+    return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"

@@ -1,0 +1,115 @@
+"""The planning problems of several clouds as one: their objects stacked, so that all their rows are solved at once."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from torchgrasp.base import join, settle
+from torchgrasp.geometry.field_batch import FieldBatch
+from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.candidates import GraspProblem
+from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.joint import JointProblem
+from torchgrasp.ik.seeds import PostureLibrary
+from torchgrasp.plan.problem import ContactProblem, Shape, rows_of
+from torchgrasp.plan.solve import plan_chunk, stages_for
+from torchgrasp.plan.starts import chunk_sizes, drawn_starts
+from torchgrasp.planner.problem import Problem, settle_hand
+from torchgrasp.shape.batch import ShapeBatch
+from torchgrasp.success.body import EstimatedBody
+from torchgrasp.values import Certificate, ContactPlan, Contacts
+
+Owner = Int[Tensor, "b"]
+"""The index of the cloud to which each row belongs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stack:
+    """The problems of c clouds, which share hand and request: the fields have one row for each cloud.
+
+    The fields of a single problem are its own values, which are those of all rows.
+    """
+
+    problems: tuple[Problem, ...]
+    hand: Hand
+    shape: Shape
+    constraints: ContactProblem
+    body: EstimatedBody
+    world: CollisionWorld
+
+    @classmethod
+    def of(cls, problems: Sequence[Problem], device: torch.device | None = None) -> "Stack":
+        """Stack problems without scenes, moved to a device; a single problem stays as it is unless it is moved."""
+        first = problems[0]
+        if len(problems) == 1 and device in (None, first.shape.device):
+            constraints = ContactProblem.of(first.shape, first.spec)
+            return cls((first,), first.hand, first.shape, constraints, first.body, first.world)
+        device = first.shape.device if device is None else device
+        shape = ShapeBatch.of([problem.shape for problem in problems]).to(device)
+        rings = shape.scales.new_tensor([problem.spec.ring_radius for problem in problems])
+        bodies = [problem.body for problem in problems]
+        field = FieldBatch.of([body.field for body in bodies]).to(device)  # pyright: ignore[reportArgumentType]
+        numbers = (
+            shape.scales.new_tensor([getattr(b, name) for b in bodies]) for name in ("size", "height", "breadth")
+        )
+        body = EstimatedBody(shape, field, torch.stack([b.center for b in bodies]).to(device), *numbers)
+        world = CollisionWorld(field, first.spec.plane)
+        constraints = ContactProblem.of(shape, first.spec, rings)
+        return cls(tuple(problems), settle_hand(first.hand, device), shape, constraints, body, world)
+
+    def __len__(self) -> int:
+        """Return the number of clouds."""
+        return len(self.problems)
+
+    @property
+    def first(self) -> Problem:
+        """The problem of the first cloud, for what all have in common."""
+        return self.problems[0]
+
+    @cached_property
+    def library(self) -> PostureLibrary:
+        """Random postures of the hand, from which initial postures near contacts are chosen."""
+        return settle(
+            PostureLibrary.of(self.first.hand, self.first.postures, self.first.request.seed), self.body.center.device
+        )
+
+    def plans(self, sizes: Sequence[int]) -> Iterator[tuple[ContactPlan, Owner]]:
+        """Yield one plan after another, with the cloud of each row; plan k comes from `sizes[k]` guesses a cloud."""
+        chunks, seed = [chunk_sizes(size) for size in sizes], self.first.request.seed
+        starts = [drawn_starts(p.shape, p.flat, itertools.chain(*chunks), seed) for p in self.problems]
+        stages, device = stages_for(self.first.spec), self.body.center.device
+        for parts in chunks:
+            plans, owners = list[ContactPlan](), list[Tensor]()
+            for size in parts:
+                first = torch.cat([next(drawn) for drawn in starts]).to(device)
+                owner = torch.arange(len(self), device=device).repeat_interleave(size)
+                shape, constraints = rows_of(self.shape, owner), self.constraints.rows(owner)
+                plans.append(plan_chunk(shape, constraints, first, stages))
+                owners.append(owner)
+            yield join(plans), torch.cat(owners)
+
+    def reach(self, contacts: Contacts, certificate: Certificate, owner: Owner) -> GraspProblem:
+        """Return the inverse kinematics problem of reaching contacts, with their certificate of force closure."""
+        center, one = self.body.rows(owner).center, self.first
+        return GraspProblem(
+            self.hand, contacts, certificate, self.world.rows(owner), center, one.reachable, one.descends
+        )
+
+    def slide(self, owner: Owner) -> JointProblem:
+        """Return the problem of hand and sliding contacts together, for rows of the given clouds."""
+        world = self.world.rows(owner)
+        return JointProblem(self.hand, rows_of(self.shape, owner), self.constraints.rows(owner), world)
+
+
+def by_cloud(owner: Owner, clouds: int) -> list[Int[Tensor, "k"]]:
+    """Return the indices of the rows of each cloud, in their order; on the CPU for more than one cloud."""
+    if clouds == 1:
+        return [torch.arange(len(owner), device=owner.device)]
+    owner = owner.cpu()
+    order, count = torch.argsort(owner, stable=True), torch.bincount(owner, minlength=clouds)
+    return list(order.split(count.tolist()))

@@ -1,0 +1,237 @@
+"""The shapes of many clouds as one: each row of contacts or of hands belongs to the shape of its own cloud.
+
+Stages that work on rows ask a shape for values at the rows' points, and go on with the shape's `rows`. A `ShapeGP` is
+the shape of all its rows. A `ShapeBatch` stacks the observations of c clouds, and knows the cloud of each row.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value, at_once, spread
+from torchgrasp.errors import BadArgument
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.jets import Weighted, evaluate_jet, evaluate_mean, evaluate_mean_jet
+from torchgrasp.shape.kernel import Kernel, cross_covariance, differentiate_thin_plate, thin_plate
+from torchgrasp.shape.values import MeanJet, SurfaceJet
+
+Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
+"""A function of points and the surface of each."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Walls(Value):
+    """The posteriors of w surfaces with thin-plate kernels; missing observations have the weight 0.
+
+    Args:
+        x: observed points, those with normals first.
+        a: weight of each observed distance.
+        b: weight of each observed normal, of the first `near` points.
+        whitener: rows of covariances with all observations (distances, then normals by component), times this matrix,
+            are white.
+        psi: length of each kernel.
+    """
+
+    x: Float[Tensor, "w n 3"]
+    a: Float[Tensor, "w n"]
+    b: Float[Tensor, "w near 3"]
+    whitener: Float[Tensor, "w rows rows"]
+    psi: Float[Tensor, "w"]
+
+    @classmethod
+    def of(cls, shapes: Sequence[ShapeGP]) -> "Walls":
+        """Stack the posteriors of shapes, each of one surface."""
+        near = max(shape.n_oriented for shape in shapes)
+        n = near + max(len(shape.x) - shape.n_oriented for shape in shapes)
+        sizes = (n, 3), (n,), (near, 3), (n + 3 * near, n + 3 * near)
+        x, a, b, whitener = (shapes[0].x.new_zeros(len(shapes), *size) for size in sizes)
+        for w, shape in enumerate(shapes):
+            oriented = torch.arange(shape.n_oriented, device=x.device)
+            place = torch.cat([oriented, near + torch.arange(len(shape.x) - len(oriented), device=x.device)])
+            rows = torch.cat([place, *(n + k * near + oriented for k in range(3))])
+            x[w, place], a[w, place], b[w, oriented], _ = shape.weighted
+            one = torch.eye(len(shape.weights), dtype=x.dtype, device=x.device)
+            whitener[w, rows, : len(rows)] = shape.whiten(one)
+        return cls(x, a, b, whitener, x.new_tensor([shape.psi for shape in shapes]))
+
+    def weighted(self, wall: Int[Tensor, "q"]) -> Weighted:
+        """Return the observations and weights of the surface of each query point."""
+        psi = self.psi[wall, None]
+        kernel = Kernel(partial(thin_plate, psi=psi), closed_form=partial(differentiate_thin_plate, psi))
+        return Weighted(self.x[wall], self.a[wall], self.b[wall], kernel)
+
+    def whiten(self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
+        """Return rows of covariances with the observations of each row's surface, whitened; see `Posterior.whiten`."""
+        return self._together(wall, rows, lambda own, matrix: (own @ matrix,))[0]
+
+    def explain(
+        self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"]
+    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q rows"]]:
+        """Return what the observations of each row's surface explain; see `Posterior.explain`."""
+
+        def explain(own: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
+            whitened = own @ matrix
+            return torch.linalg.vecdot(whitened, whitened), whitened @ matrix.mT
+
+        return self._together(wall, rows, explain)  # pyright: ignore[reportReturnType]
+
+    def _together(
+        self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"], function: Evaluate
+    ) -> tuple[Tensor, ...]:
+        """Return a function of the rows of each surface, (w, m, rows), and the surfaces' whiteners, for all rows."""
+        matrix, group = self.whitener, wall
+        if rows.device.type == "cpu":  # few surfaces have rows in a small chunk
+            found, group = torch.unique(wall, return_inverse=True)
+            matrix = matrix[found]
+        order = torch.argsort(group, stable=True)
+        group, count = group[order], torch.bincount(group, minlength=len(matrix))
+        slot = torch.arange(len(rows), device=rows.device) - (count.cumsum(0) - count)[group]
+        padded = rows.new_zeros(len(matrix), int(count.max()), rows.shape[1])
+        padded[group, slot] = rows[order]
+        back = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
+        return tuple(x[group, slot][back] for x in function(padded, matrix))
+
+
+@dataclasses.dataclass(frozen=True)
+class ShapeBatch(Value):
+    """The shapes of c clouds: row r of all points that a method is given belongs to cloud `owner[r]`.
+
+    Numbers of a shape, such as its `scale`, are tensors with one number for each row.
+
+    Args:
+        surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open vessels.
+        wall: the indices of each cloud's outer and inner surface, which are the same if the object is not hollow.
+        centers, scales, radii, factors: center [m], scale [m], domain radius and factor of deviations of each cloud.
+        owner: the cloud of each row.
+        hollow: whether any object is hollow.
+    """
+
+    surfaces: Walls
+    wall: Int[Tensor, "c 2"]
+    centers: Float[Tensor, "c 3"]
+    scales: Float[Tensor, "c"]
+    radii: Float[Tensor, "c"]
+    factors: Float[Tensor, "c"]
+    owner: Int[Tensor, "r"]
+    hollow: bool
+
+    @classmethod
+    def of(cls, shapes: Sequence[ShapeGP]) -> "ShapeBatch":
+        """Stack shapes on one device, with one row for each; raise `BadArgument` for another kernel."""
+        for shape in shapes:
+            form = shape.kernel.closed_form
+            if not (isinstance(form, partial) and form.func is differentiate_thin_plate):
+                raise BadArgument("shapes", "a shape with another kernel", "thin-plate kernels")
+        outer, inner = [s.walls[0] for s in shapes], [s.walls[1] for s in shapes if len(s.walls) > 1]
+        own, device = torch.arange(len(shapes), device="cpu"), shapes[0].device
+        second = torch.tensor([len(s.walls) > 1 for s in shapes], device="cpu")
+        wall = torch.stack([own, torch.where(second, len(shapes) - 1 + second.cumsum(0), own)], 1).to(device)
+        numbers = [[getattr(s, name) for s in shapes] for name in ("scale", "domain_radius", "std_factor")]
+        scales, radii, factors = (torch.tensor(x, dtype=torch.float64, device=device) for x in numbers)
+        centers, surfaces = torch.stack([s.center for s in shapes]).double(), Walls.of([*outer, *inner])
+        return cls(surfaces, wall, centers, scales, radii, factors, own.to(device), bool(inner))
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the shapes."""
+        return self.centers.device
+
+    @property
+    def scale(self) -> Float[Tensor, "b"]:
+        """The length [m] of one normalised unit, of each row."""
+        return self.scales[self.owner]
+
+    @property
+    def domain_radius(self) -> Float[Tensor, "b"]:
+        """The radius, normalised, in which the shape is known, of each row."""
+        return self.radii[self.owner]
+
+    @property
+    def std_factor(self) -> Float[Tensor, "b"]:
+        """The factor of standard deviations, of each row."""
+        return self.factors[self.owner]
+
+    @cached_property
+    def walls(self) -> "tuple[ShapeBatch, ...]":
+        """The outer surfaces and, if any object is hollow, the inner ones, each as shapes of one surface."""
+        if not self.hollow:
+            return (self,)
+        sides = [self.wall[:, side, None].expand(-1, 2) for side in (0, 1)]
+        return tuple(dataclasses.replace(self, wall=side, hollow=False) for side in sides)
+
+    def rows(self, index: Int[Tensor, "k"]) -> "ShapeBatch":
+        """Return the shapes of some of the rows."""
+        return dataclasses.replace(self, owner=self.owner[index])
+
+    def normalise(self, points: Float[Tensor, "b *k 3"]) -> Float[Tensor, "b *k 3"]:
+        """Return points [m] of each row in the normalised frame of its cloud."""
+        center = spread(self.centers[self.owner].to(points), points, 1)
+        return (points - center) / spread(self.scale.to(points), points)
+
+    def metres(self, x: Float[Tensor, "b *k 3"]) -> Float[Tensor, "b *k 3"]:
+        """Return normalised points of each row in metres."""
+        return x * spread(self.scale, x) + spread(self.centers[self.owner], x, 1)
+
+    def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
+        """Return a mask (points, walls): which of the `walls` is the surface at each normalised point."""
+        if not self.hollow:
+            return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
+        own = self._surface_at(x) == self._wall(x)[:, 0]
+        return torch.stack([own, ~own], 1)
+
+    def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+        """Return the mean signed distance and its gradient at normalised points."""
+        return self._evaluate(lambda part, wall: evaluate_mean(self.surfaces.weighted(wall), part, gradient=True), x)  # pyright: ignore
+
+    def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
+        """Return the mean distance with first and second derivatives at normalised points."""
+        found = self._evaluate(lambda part, wall: evaluate_mean_jet(self.surfaces.weighted(wall), part)[0], x)
+        return MeanJet(*found)
+
+    def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
+        """Return mean and variance of the distance with their derivatives at normalised points."""
+
+        def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
+            return evaluate_jet(self.surfaces.weighted(wall), part, partial(self.surfaces.explain, wall))
+
+        return SurfaceJet(*self._evaluate(evaluate, x))
+
+    def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+        """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of the paper."""
+
+        def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:
+            of, psi = self.surfaces.weighted(wall), self.surfaces.psi[wall]
+            rows = cross_covariance(of.kernel, part, of.x, of.b.shape[1]).transpose(0, 1)
+            weights = torch.cat([of.a, of.b.mT.flatten(1)], 1)
+            whitened = self.surfaces.whiten(wall.repeat_interleave(4), rows.flatten(0, 1)).view_as(rows)
+            prior = torch.diag_embed(torch.stack([psi**3, 6 * psi, 6 * psi, 6 * psi], 1))
+            return (rows @ weights[..., None])[..., 0], prior - whitened @ whitened.mT
+
+        return self._evaluate(evaluate, x)  # pyright: ignore[reportReturnType]
+
+    def _wall(self, x: Float[Tensor, "q 3"]) -> Int[Tensor, "q 2"]:
+        """Return the outer and the inner surface of the cloud of each point."""
+        return self.wall[self.owner].repeat_interleave(len(x) // max(len(self.owner), 1), 0)
+
+    def _surface_at(self, x: Float[Tensor, "q 3"]) -> Int[Tensor, "q"]:
+        """Return the surface that applies at each point: of a hollow object the one with the greater mean distance."""
+        outer, inner = self._wall(x).unbind(1)
+        if not self.hollow:
+            return outer
+        mean = [self._evaluate(partial(_mean_of, self.surfaces), x, wall)[0] for wall in (outer, inner)]
+        return torch.where(mean[1] > mean[0], inner, outer)
+
+    def _evaluate(self, evaluate: Evaluate, x: Float[Tensor, "q 3"], wall: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Return the results of a function of points and surfaces, for chunks of points, joined."""
+        wall = self._surface_at(x) if wall is None else wall
+        size = at_once(x, 256)
+        parts = [evaluate(*part) for part in zip(x.split(size), wall.split(size), strict=True)]
+        return tuple(map(torch.cat, zip(*parts, strict=True)))
+
+
+def _mean_of(surfaces: Walls, x: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
+    return evaluate_mean(surfaces.weighted(wall), x, gradient=False)
