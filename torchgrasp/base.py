@@ -187,7 +187,7 @@ def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
 
 def at_once(x: Tensor, size: int) -> int:
     """Return how many rows of `x` to work on at once: `size` on a CPU, whose cache then holds all temporaries."""
-    return size if x.device.type == "cpu" else 64 * size  # fewer leave an accelerator idle, more fill its memory
+    return size if x.device.type == "cpu" else 256 * size  # fewer leave an accelerator idle, more fill its memory
 
 
 def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
