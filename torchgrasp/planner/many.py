@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchgrasp.base import settle
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra
 from torchgrasp.files import temporary_folder
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_tasks
 from torchgrasp.planner.batches import plan_hands
-from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import finish, plan_request
 from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud, load_grasps
@@ -71,7 +70,7 @@ def plan_stack(requests: Sequence[Request], device: torch.device) -> list[Grasps
     A bad cloud gives an empty set of grasps, and does not affect the others.
     """
     found, problems = dict[int, Grasps](), dict[int, Problem]()
-    hand, budget = settle(requests[0].hands[0], torch.device("cpu")), requests[0].time_budget
+    hand, budget = settle_hand(requests[0].hands[0], torch.device("cpu")), requests[0].time_budget
     deadline = math.inf if budget is None else time.monotonic() + budget
     for k, request in enumerate(requests):
         try:
