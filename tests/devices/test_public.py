@@ -1,5 +1,7 @@
 """Every public function with every tensor on another device: the CPU's result there, or an error that names it."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -36,6 +38,7 @@ from torchgrasp.plan import least_friction_forces
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
 from torchgrasp.testing import random_joints
+from torchgrasp.values import ContactPlan
 
 SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
 VIEW = load_object("cylinder").view
@@ -60,6 +63,13 @@ CLOUDS = {
     "cut_object": lambda cloud: cut_object(cloud, UP.to(cloud.points)),
     "cloud_from_depth": lambda cloud: cloud_from_depth(CLOSE.to(cloud.points), LENS.to(cloud.points)),
 }
+
+
+def without_forces(plan: ContactPlan) -> tuple[Any, ...]:
+    """Return a plan without the coefficients of its forces: which of several balances is found depends on rounding."""
+    return plan.contacts, plan.quality, plan.status
+
+
 SHAPES = {
     "predict": lambda shape, x: shape.predict(x),
     "differentiate": lambda shape, x: shape.differentiate(x),
@@ -68,9 +78,9 @@ SHAPES = {
     "update": lambda shape, x: shape.update(x[:1], noise=0.001),
     "contains": lambda shape, x: shape.contains(x),
     "extract_surface": lambda shape, x: extract_surface(shape, 24),
-    "plan_contacts": lambda shape, x: plan_contacts(shape, SPEC, 6),
-    "plan_contacts, paper": lambda shape, x: plan_contacts(shape, ContactSpec.paper(), 2),
-    "plan_contacts, given starts": lambda shape, x: plan_contacts(shape, SPEC, x[:12].reshape(4, 3, 3)).contacts,
+    "plan_contacts": lambda shape, x: without_forces(plan_contacts(shape, SPEC, 6)),
+    "plan_contacts, paper": lambda shape, x: without_forces(plan_contacts(shape, ContactSpec.paper(), 2)),
+    "plan_contacts, given starts": lambda shape, x: without_forces(plan_contacts(shape, SPEC, x[:12].reshape(4, 3, 3))),
 }
 CONTACTS = {
     "certify": lambda contacts, shape: certify(contacts, SPEC),
