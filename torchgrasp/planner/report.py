@@ -20,12 +20,13 @@ class Report:
     def __init__(self, problem: Problem, batches: int, planned: int) -> None:
         """Take the number of all `batches`, and the number `planned` of those batches that plan new initial guesses."""
         self.problem, self.batches, self.planned = problem, batches, planned
+        self.heard = problem.request.observer is not ignore  # without an observer nothing is stored or counted
         self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
         self.ended = self.offered = self.closed = 0
 
     def shape(self) -> None:
         """Report the estimated shape, and the fraction of its surface with a standard deviation below 4 mm."""
-        if self.problem.request.observer is ignore:
+        if not self.heard:
             return
         shape, vertices = self.problem.shape, self.problem.surface.vertices
         jet = shape.jet(shape.normalise(vertices[:: len(vertices) // 500 + 1]))
@@ -35,6 +36,8 @@ class Report:
 
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
         """Store the result of one stage of one batch; `offered` is how many contact sets stage "certify" checked."""
+        if not self.heard:
+            return
         if stage == "query":  # rows are counted through all batches
             value = dataclasses.replace(value, row=value.row + self.closed - len(self.parts["certify"][-1]))
         elif stage == "certify":
@@ -45,8 +48,10 @@ class Report:
 
     def end_batch(self, grasps: Grasps, last: bool) -> None:
         """Report that a batch has ended; if it is the `last` one, report the stages not yet reported, too."""
+        if not self.heard:
+            return
         self.ended += 1
-        if self.ended < self.batches and self.problem.request.observer is not ignore:
+        if self.ended < self.batches:
             good = int(executable(grasps).sum())
             best = f", the best {format_success(grasps)} likely" if good else ""
             text = f"{self.ended} of {self.batches}: {good} executable of {len(grasps)}{best}"
@@ -57,8 +62,6 @@ class Report:
 
     def _tell(self, stage: str) -> None:
         """Report to the observer the results of one stage, from all batches so far."""
-        if self.problem.request.observer is ignore:
-            return
         value = join(self.parts[stage])
         if stage == "plan":
             text = f"{len(value)} starts: {describe(count_status(value.status))}"
