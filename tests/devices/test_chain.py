@@ -90,7 +90,7 @@ def test_clouds_planned_together_have_the_grasps_of_each_alone(device, hand):
     together = plan_grasps(sent(clouds), hand, SPEC, 6, task=task)
     assert "refused" in together[1].meta and all(grasps.joints.device == DEVICE for grasps in together)
     for there, here in zip(together[::2], alone[::2], strict=True):
-        assert there.meta == here.meta and share_found(here, here.to(DEVICE).to("cpu")) == 1.0
+        assert there.meta == here.meta
         assert share_found(here, there.to("cpu")) > 0.9  # rounding may move a few
 
 

@@ -158,14 +158,9 @@ class SelfCollision(Value):
 
     def _choose(self, near: Bool[Tensor, "p n"]) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"], Parts]:
         """Return the pairs and postures of a mask, sorted by pair, and the slice of each kind of pair."""
-        if near.device.type == "cpu":
-            pair, row = torch.nonzero(near, as_tuple=True)
-            counts = [int((pair < end).sum()) for end in itertools.accumulate(self.kinds)]
-        else:  # one wait, for the sizes
-            ends = [part.sum() for part in near.split(self.kinds)]
-            counts = torch.stack(ends).cumsum(0).tolist()
-            pair, row = torch.nonzero_static(near, size=counts[-1]).unbind(1)
-        bounds = itertools.pairwise((0, *counts))
+        ends = torch.stack([part.sum() for part in near.split(self.kinds)]).cumsum(0).tolist()  # the only wait
+        pair, row = torch.nonzero_static(near, size=ends[-1]).unbind(1)
+        bounds = itertools.pairwise((0, *ends))
         return pair, row, [(kind, slice(low, high)) for kind, (low, high) in enumerate(bounds) if high > low]
 
     def _separations(

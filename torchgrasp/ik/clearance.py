@@ -131,9 +131,7 @@ class CollisionWorld(Value):
         """Return the surroundings of some of the rows of hands; a single object's are those of all rows."""
         if self.field is None or isinstance(self.field, SignedDistanceField):
             return self
-        new = object.__new__(CollisionWorld)
-        vars(new).update(vars(self) | {"field": self.field.rows(index), "plane": self.plane})
-        return new
+        return dataclasses.replace(self, field=self.field.rows(index))
 
     @property
     def guarded(self) -> bool:

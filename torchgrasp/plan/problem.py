@@ -192,7 +192,7 @@ class ContactProblem:
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
         """Return the problems of some of the rows."""
-        names = [name for name in ("domain_radius", "separation", "tip_radius", "ring", "floor")]
+        names = "domain_radius", "separation", "tip_radius", "ring", "floor"
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
         return dataclasses.replace(self, **own) if own else self
 

@@ -15,7 +15,6 @@ from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_as_p
 from torchgrasp.ik.joint import solve_sliding, try_best_seeds
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.ik.refine import ITERATIONS
-from torchgrasp.plan.starts import check_starts
 from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.report import Report
@@ -133,8 +132,6 @@ class Planner:
         `time.monotonic`.
         """
         stack, problem, request = self.stack, self.stack.first, self.stack.first.request
-        for each in stack.problems:
-            check_starts(each.shape, each.given_spec, request.starts)
         most = TRIED if problem.scene is None else TRIED_IN_SCENE
         batches = schedule(request.starts, most) if request.mode == "joint" else [Batch(request.starts, most)]
         sizes = [batch.starts for batch in batches if batch.starts]
@@ -160,40 +157,29 @@ class Planner:
             ranked = rank(stack, join_owned(waiting))
             waiting.clear()
             if late:
-                rest = [failed for _, failed in (*self.unfinished, *self.unsolved)]
-                rows = [by_cloud(part.owner, len(stack)) for part in rest]
-                ranked = [
-                    join(
-                        [
-                            grasps,
-                            *(x.grasps[own[c]].to(grasps.joints.device) for x, own in zip(rest, rows, strict=True)),
-                        ]
-                    )
-                    for c, grasps in enumerate(ranked)
-                ]
+                ranked = self._with_failures(ranked)
             report.end_batch(ranked[0], last=late)
             yield [dataclasses.replace(grasps, meta={"starts": str(planned)}) for grasps in ranked]
             if late:
                 return
 
-    def _solve_joint(self, plan: tuple[ContactPlan, Owner] | None, tried: int, report: "Report", last: bool) -> Owned:
+    def _solve_joint(self, plan: tuple[ContactPlan, Owner] | None, tried: int, report: Report, last: bool) -> Owned:
         """Return grasps on the most promising contact sets so far, and on sets that earlier batches left unsolved."""
         if plan is not None:
             found = find_contacts(self.stack, *plan, OFFERED * tried, report.note)
             self.pool.add(found, contact_costs(self.stack, found))
         found, done = self.pool.take(tried), list[Owned]()
-        if self.first and not last:
+        first, self.first = self.first, False
+        if first and not last:
             solved, rest, failed = self._on_fixed_contacts(found, FIRST_STEPS)
             without = self._without(solved)
             self.unfinished.append(_part(rest, failed, ~without))
             found, done = found.select(torch.nonzero(without[found.owner])[:, 0]), [solved]
             if not bool(without.any()):
-                self.first = False
                 return solved
         else:
             found = join_seeded([*(rest for rest, _ in self.unfinished), found])
             self.unfinished.clear()
-        self.first = False
         solved, rest, failed = self._on_fixed_contacts(found, ITERATIONS)
         self.unsolved.append((rest, failed))
         sliding = torch.ones(len(self.stack), dtype=torch.bool, device=rest.owner.device)
@@ -205,6 +191,15 @@ class Planner:
             rests, failures = zip(*now, strict=True)
             solved = join_owned([solved, self._with_sliding_contacts(join_seeded(rests), join_owned(failures))])
         return join_owned([*done, solved])
+
+    def _with_failures(self, ranked: list[Grasps]) -> list[Grasps]:
+        """Return the grasps of each cloud, followed by the failed grasps of contact sets that were left for later."""
+        parts = [failed for _, failed in (*self.unfinished, *self.unsolved)]
+        if not parts:
+            return ranked
+        grasps, owner = join_owned(parts)
+        clouds = zip(ranked, by_cloud(owner, len(self.stack)), strict=True)
+        return [join([found, grasps[own].to(found.joints.device)]) for found, own in clouds]
 
     def _without(self, solved: Owned) -> Bool[Tensor, "c"]:
         """Return a mask of the clouds that have no grasp among those solved."""

@@ -85,7 +85,6 @@ class Problem:
 
     def prepared(self) -> "Problem":
         """Return this problem after the values that stages need were computed; raise `BadArgument` as they do."""
-        check_starts(self.shape, self.given_spec, self.request.starts)
         _ = self.flat, self.body, self.vague
         return self
 
@@ -115,6 +114,7 @@ class Problem:
     def flat(self) -> Settled:
         """The contact constraints, with the radius on which a contact must be flat, and the flat candidate contacts."""
         spec = dataclasses.replace(self.given_spec, table=None if self.given_spec.table is None else 0.0)
+        check_starts(self.shape, spec, self.request.starts)
         tips = self.hand.tips
         spec = dataclasses.replace(spec.for_fingertips(float(tips.radius.max())), fingertips=len(tips))
         return settle_flatness(self.shape, spec, self.request.seed)

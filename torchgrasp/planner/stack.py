@@ -58,7 +58,8 @@ class Stack:
             shape.scales.new_tensor([getattr(b, name) for b in bodies]) for name in ("size", "height", "breadth")
         )
         body = EstimatedBody(shape, field, torch.stack([b.center for b in bodies]).to(device), *numbers)
-        world = CollisionWorld(field, first.spec.plane)
+        plane = first.spec.plane
+        world = CollisionWorld(field, None if plane is None else plane.to(device))
         constraints = ContactProblem.of(shape, first.spec, rings)
         return cls(tuple(problems), settle_hand(first.hand, device), shape, constraints, body, world)
 

@@ -204,11 +204,11 @@ class ShapeBatch(Value):
         """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of the paper."""
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:
-            of, psi = self.surfaces.weighted(wall), self.surfaces.psi[wall]
+            of, zero = self.surfaces.weighted(wall), torch.zeros_like(part)
             rows = cross_covariance(of.kernel, part, of.x, of.b.shape[1]).transpose(0, 1)
             weights = torch.cat([of.a, of.b.mT.flatten(1)], 1)
             whitened = self.surfaces.whiten(wall.repeat_interleave(4), rows.flatten(0, 1)).view_as(rows)
-            prior = torch.diag_embed(torch.stack([psi**3, 6 * psi, 6 * psi, 6 * psi], 1))
+            prior = cross_covariance(of.kernel, zero, zero[:, None], 1).transpose(0, 1)
             return (rows @ weights[..., None])[..., 0], prior - whitened @ whitened.mT
 
         return self._evaluate(evaluate, x)  # pyright: ignore[reportReturnType]
