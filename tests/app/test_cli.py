@@ -115,10 +115,18 @@ def test_check_folder_leaves_a_folder_as_it_was(tmp_path):
 @pytest.mark.promise("F9")
 @pytest.mark.parametrize("missing", ["sapien", "libX11.so.6: cannot open shared object file"])
 def test_a_missing_simulator_is_named_before_the_work(missing, tmp_path, run_command, monkeypatch, refuse_work):
-    def fail(name):
+    find, load = inputs.importlib.util.find_spec, inputs.importlib.import_module
+
+    def fail(name, *package):
+        """Other packages may be imported here for the first time."""
+        if name != "sapien":
+            return load(name, *package)
         raise ImportError(missing)
 
-    monkeypatch.setattr(inputs.importlib.util, "find_spec", lambda name: None if missing == "sapien" else "found")
+    def look(name, *package):
+        return find(name, *package) if name != "sapien" else None if missing == name else "found"
+
+    monkeypatch.setattr(inputs.importlib.util, "find_spec", look)
     monkeypatch.setattr(inputs.importlib, "import_module", fail)
     code, _, error = run_command("grasp", VIEW, "--mesh", MESH, "--close", "--out", tmp_path / "out")
     assert code == 2 and missing in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
