@@ -7,6 +7,7 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import torch
+from benchmarks.load.swarm import begin
 
 from torchgrasp.campaign.folder import Campaign
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard
@@ -24,6 +25,7 @@ ASKED = {
     "protocol": {"name": "toy", "noise": {"draws": TRIES}, "trial": {"simulator": "none", "friction": 0.5}},
     "trials": {"grasps": 3, "ranks": "best", "starts": 1, "seed": 0},
     "versions": {"torchgrasp": "0", "mujoco": "none"},
+    "device": "cpu",
 }
 
 
@@ -80,6 +82,18 @@ def die_at(number: int, row: JobRow, meta: dict[str, str], deadly: int) -> bytes
     if number == deadly:
         os.kill(os.getpid(), signal.SIGKILL)
     return cheap_job(number, row, meta)
+
+
+def seen_job(number: int, row: JobRow, meta: dict[str, str], plans: list[int] | None = None) -> bytes:
+    """Do a job on a worker in this process; with plans, it is the job that has the number's plan."""
+    begin(number)
+    return cheap_job(number if plans is None else plans[number % len(plans)], row, meta)
+
+
+def seen_plan(numbers: list[int]) -> list[int]:
+    """Return the numbers of jobs as their plans."""
+    begin(-1 - numbers[0])
+    return numbers
 
 
 def wait_at(number: int, row: JobRow, meta: dict[str, str], patient: int, path: str) -> bytes:

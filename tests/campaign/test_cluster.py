@@ -1,20 +1,39 @@
-"""A real Dask cluster of processes on this machine: a worker is killed, versions differ, nobody answers."""
+"""A real Dask cluster, of processes or of many workers in this one: workers die, plan for others, nobody answers."""
 
+import dataclasses
+import json
 import os
+import shutil
 import signal
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
+from benchmarks.load.swarm import BEGAN, FATAL, outstanding, swarm
 
-from tests.campaign.cheap import campaign, cheap_job, contents, die_at, wait_at, work_on
+from tests.campaign.cheap import (
+    campaign,
+    cheap_job,
+    contents,
+    die_at,
+    seen_job,
+    seen_plan,
+    wait_at,
+    work_on,
+)
 from tests.campaign.conftest import QUICK
+from tests.make import same_bits
 from torchgrasp import load_hand
+from torchgrasp.campaign import cluster as cluster_module
+from torchgrasp.campaign import folder as folder_module
+from torchgrasp.campaign import run as run_module
 from torchgrasp.campaign import run_campaign
-from torchgrasp.campaign.cluster import run_on_cluster
+from torchgrasp.campaign.cluster import OnGpu, plan_jobs, run_on_cluster
 from torchgrasp.campaign.folder import carry_out
-from torchgrasp.errors import BadArgument, MissingExtra, Status
+from torchgrasp.data import read_shards
+from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
 
 distributed = pytest.importorskip("distributed")
 JOBS = 17
@@ -94,3 +113,81 @@ def test_no_scheduler_and_no_dask_are_named(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(MissingExtra, match=r"torchgrasp\[cluster\]"):
         list(run_on_cluster(divmod, [(7, 2)], "tcp://127.0.0.1:1", 1.0))
+
+
+@pytest.fixture
+def forty():
+    """Forty workers in this process."""
+    with swarm(40) as cluster:
+        yield cluster
+
+
+@pytest.mark.promise("F4")
+@pytest.mark.filterwarnings("ignore")
+def test_four_of_forty_workers_die_and_every_job_is_written_once(forty, tmp_path: Path, monkeypatch):
+    """The scheduler, which holds no more jobs than it may, gives the jobs of the dead to others."""
+    jobs, most, held, written = 100, 45, list[int](), Counter[str]()
+    asked, write = campaign(jobs, 16), folder_module.write_file
+    monkeypatch.setattr(folder_module, "write_file", lambda path, x: written.update([path.name]) or write(path, x))
+    monkeypatch.setattr(cluster_module, "OUTSTANDING", most)
+    FATAL.update(dict.fromkeys((1, 30, 60, 99), forty))
+
+    def work(numbers):
+        tasks = ((j, asked.rows[j], asked.meta) for j in numbers)
+        return run_on_cluster(seen_job, tasks, forty.scheduler_address, 60.0)
+
+    carry_out(asked, tmp_path / "out", work, lambda row: held.append(outstanding(forty)))
+    assert len(forty.scheduler.workers) == 36 and not FATAL and max(held) <= most
+    tries = Counter(number for number, _ in BEGAN)
+    assert {number for number, n in tries.items() if n > 1} >= {1, 30, 60, 99}
+    assert set(tries) == set(range(jobs)) - {2}  # which is refused before any work
+    assert {name: n for name, n in written.items() if name.startswith("job")} == {
+        f"job-{j:06}.safetensors": 1 for j in range(jobs)
+    }
+    carry_out(asked, tmp_path / "whole", work_on(asked, 0))
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+@pytest.mark.promise("F4")
+@pytest.mark.filterwarnings("ignore")
+def test_a_worker_with_a_gpu_plans_for_a_shard_and_another_one_if_it_dies(forty, tmp_path: Path):
+    asked, size = campaign(64, 16), 16
+    with_gpu = list(forty.workers.values())[:3]
+    for worker in with_gpu:
+        forty.sync(worker.set_resources, GPU=1)
+    FATAL[-1 - 16] = forty
+
+    def work(numbers):
+        shards = {k: OnGpu(seen_plan, ([*range(k * size, (k + 1) * size)],)) for k in range(4)}
+        tasks = ((j, asked.rows[j], asked.meta, shards[j // size]) for j in numbers)
+        return run_on_cluster(seen_job, tasks, forty.scheduler_address, 60.0)
+
+    carry_out(asked, tmp_path / "out", work)
+    plans = [(number, where) for number, where in BEGAN if number < 0]
+    assert {where for _, where in plans} <= {worker.address for worker in with_gpu}
+    assert {number for number, _ in plans} == {-1, -17, -33, -49} and 5 <= len(plans) <= 8
+    carry_out(asked, tmp_path / "whole", work_on(asked, 0))
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_plans_of_a_batch_are_tried_and_say_their_device(forty, carton: Path, data: Path, tmp_path: Path, monkeypatch):
+    """The processor stands for the GPU: the records of the only sound view are those of its plan alone."""
+    objects, out, spec = tmp_path / "objects", tmp_path / "out", dataclasses.replace(QUICK, device="cuda")
+    shutil.copytree(carton, objects)
+    entries = json.loads((objects / "manifest.json").read_text())["objects"]
+    (objects / "manifest.json").write_text(json.dumps({"objects": entries | {"a gone one": entries["carton"]}}))
+    forty.sync(next(iter(forty.workers.values())).set_resources, GPU=1)
+    monkeypatch.setattr(run_module, "plan_jobs", lambda *task: plan_jobs(*task[:-1], "cpu"))
+    run_campaign(objects, load_hand("barrett"), out, spec, forty.scheduler_address)
+    gone, there = (read_shards(out).job(j) for j in (0, 1))
+    alone = read_shards(data).job(0)
+    assert gone.row.status is Status.BAD_OBJECT and "no file" in gone.row.note
+    assert same_bits(there.grasps, alone.grasps) and there.passed.equal(alone.passed)
+    assert there.row._replace(meta=alone.row.meta) == alone.row
+    assert there.row.meta == alone.row.meta | {"device": "cpu"} and "planned on cuda" in (out / "README.md").read_text()
+    with pytest.raises(OutputError, match="other campaigns"):
+        run_campaign(objects, load_hand("barrett"), out, QUICK)
+    with pytest.raises(BadArgument, match="workers"):
+        run_campaign(objects, load_hand("barrett"), tmp_path / "other", spec, 1)

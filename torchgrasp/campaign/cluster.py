@@ -1,38 +1,41 @@
 """One job of a campaign, and running jobs on a Dask cluster, where a worker that dies loses only its own job."""
 
+import contextlib
 import importlib.metadata
+import itertools
 import json
 import os
 import threading
 import uuid
-from collections.abc import Callable, Generator, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Generator, Iterable
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
 from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.protocols import Protocol
-from torchgrasp.evaluation.views import EvaluationSpec, View, choose_rows, plan_view, try_grasp
+from torchgrasp.evaluation.views import EvaluationSpec, View, choose_rows, plan_view, plan_views, try_grasp
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.many import no_grasps
+from torchgrasp.threads import one_thread
+from torchgrasp.values import Grasps
 
 PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoco", "coacd")
 """Packages whose versions may change the results of a campaign."""
 Result = TypeVar("Result")
 CONNECTING = "30s"  # longest time for the scheduler to answer
+OUTSTANDING = 10_000  # tasks that the scheduler holds at once: ten for each of a thousand workers; a task costs memory
 
 
 def versions() -> dict[str, str]:
     """Return the installed versions of `PACKAGES`; "none" for a package that is not installed."""
     from torchgrasp import __version__
 
-    found = {"torchgrasp": __version__}  # of the source that runs; an installation may be older
+    found = dict.fromkeys(PACKAGES, "none") | {"torchgrasp": __version__}  # of the source; an installation may be older
     for name in PACKAGES[1:]:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "none"
     return found
 
 
@@ -42,19 +45,34 @@ def check_versions(meta: dict[str, str]) -> None:
         raise BadArgument("workers", f"one with {here}", f"workers with {meta['versions']}")
 
 
-def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str]) -> bytes:
+class OnGpu(NamedTuple):
+    """A task of a worker with the resource "GPU", whose result is an argument of other tasks."""
+
+    function: Callable[..., Any]
+    task: tuple[Any, ...]
+
+
+def plan_jobs(meta: dict[str, str], *task: Any) -> list[Grasps | None]:
+    """Return `plan_views(*task)`: plans of several jobs for `run_job`, which says what every machine must have."""
+    check_versions(meta)
+    return plan_views(*task)
+
+
+def run_job(
+    view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str], plans: object = None, place: int = 0
+) -> bytes:
     """Plan and try the grasps of one job; return the bytes of a shard file that holds only this job.
 
     Every machine must have the same hand and the same software as the machine that began the campaign: `meta` holds the
     `versions` of the software. A faulty object gives a row with the reason. Errors that are not the object's fault are
-    raised.
+    raised. The job's plan is `plans[place]` if there are `plans`, from `plan_jobs`; they are a status if it took long.
     """
     check_versions(meta)
     hand = view.load_hand()
     if hand.source.sha256 != view.hand.sha256:
         raise BadArgument("hand", f"{view.hand.urdf_path} with other files", "the same hand on every machine")
     try:
-        shard = _work(view, hand, protocol, spec)
+        shard = _work(view, hand, protocol, spec, plans[place] if isinstance(plans, list) else None)
     except (MissingExtra, OutputError, MemoryError, OSError):
         raise
     except Exception as error:  # of the library: a week of other jobs shall not end with it
@@ -63,9 +81,9 @@ def run_job(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str
     return pack_shard(shard, meta)
 
 
-def _work(view: View, hand: Hand, protocol: Protocol, spec: EvaluationSpec) -> Shard:
-    """Plan grasps on the view of a job, and try the chosen grasps in simulation."""
-    score, cloud, found = plan_view(view, protocol, spec)
+def _work(view: View, hand: Hand, protocol: Protocol, spec: EvaluationSpec, plan: Grasps | None) -> Shard:
+    """Plan grasps on the view of a job unless there is a plan, and try the chosen grasps in simulation."""
+    score, cloud, found = plan_view(view, protocol, spec, plan)
     row = JobRow(view.object, view.view, score.refusal, short(score.note), score.family, score.group)
     if cloud is None or found is None:
         return empty_shard(row, hand, protocol.noise.draws)
@@ -87,14 +105,15 @@ def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
 
 
 def run_on_cluster(
-    function: Callable[..., Result], tasks: Sequence[tuple[Any, ...]], address: str, limit: float
+    function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], address: str, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
     """Run tasks on a Dask cluster; yield the index of each task and its result, in the order in which they end.
 
     A task whose worker dies is given to another worker; after the deaths that the scheduler allows
     (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task that takes longer
-    than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. Tasks wait until a worker is free. Without Dask,
-    `MissingExtra` is raised; without a scheduler at the address, `BadArgument`.
+    than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. The scheduler holds `OUTSTANDING` tasks at most,
+    which wait until a worker is free. Successive tasks share an equal argument `OnGpu`. Without Dask, `MissingExtra` is
+    raised; without a scheduler at the address, `BadArgument`.
     """
     try:
         from distributed import CancelledError, Client, Event, KilledWorker, as_completed
@@ -106,24 +125,34 @@ def run_on_cluster(
         allowed = "the address of a running Dask scheduler, as tcp://10.0.0.1:8786"
         raise BadArgument("workers", f"{address!r} ({error})", allowed) from error
     with client:
-        run = uuid.uuid4().hex
-        names = [f"torchgrasp-late-{run}-{k}" for k in range(len(tasks))]
-        shared = _bounded, function, limit
-        futures = {client.submit(*shared, names[k], *task, pure=False): k for k, task in enumerate(tasks)}
+        run, waiting, futures = uuid.uuid4().hex, enumerate(tasks), dict[Any, int]()
+        ended, plan = as_completed(loop=client.loop), (None, None)  # the last task on a GPU, and its future
+
+        def submit(most: int) -> None:
+            nonlocal plan
+            for number, task in itertools.islice(waiting, most):
+                for new in (x for x in task if isinstance(x, OnGpu) and x != plan[0]):
+                    call = _bounded, new.function, limit, f"{run}-plan-{number}", *new.task
+                    plan = new, client.submit(*call, pure=False, priority=1, resources={"GPU": 1})
+                given = (plan[1] if isinstance(x, OnGpu) else x for x in task)
+                future = client.submit(_bounded, function, limit, f"{run}-{number}", *given, pure=False)
+                futures[future] = number
+                ended.add(future)
+
         try:
-            for future in as_completed(list(futures), loop=client.loop):
+            submit(OUTSTANDING)
+            for future in ended:
                 number = futures.pop(future)
-                late = Event(names[number], client)
                 try:
                     result = future.result()
-                except KilledWorker:
-                    result = Status.TIMED_OUT if late.is_set() else Status.WORKER_DIED
+                except KilledWorker:  # also of the worker that planned
+                    late = Event(f"{run}-{number}", client).is_set()
+                    result = Status.TIMED_OUT if late else Status.WORKER_DIED
                 except CancelledError as error:
                     found = f"{address!r}, which ended during the work"
                     raise BadArgument("workers", found, "a scheduler that goes on; the same call continues") from error
                 del future  # results that were yielded leave the memory
-                if result is Status.TIMED_OUT:
-                    late.clear()
+                submit(1)
                 yield number, result
         finally:
             client.cancel(list(futures))
@@ -146,8 +175,8 @@ def _bounded(function: Callable[..., Result], limit: float, name: str, *task: An
     clock = threading.Timer(limit, end)
     clock.daemon = True
     clock.start()
-    torch.set_num_threads(1)
     try:
-        return function(*task)
+        with one_thread():
+            return function(*task)
     finally:
         clock.cancel()

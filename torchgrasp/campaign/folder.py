@@ -213,7 +213,7 @@ standard deviation of the surface at its contacts, its predicted success, and it
 * hand: {hand["name"]}, fingers {hand["finger_names"]}, SHA-256 {hand["sha256"]}
 * grasps of a view: {trials["grasps"]} at most ({trials["ranks"]}), of {trials["starts"]} starts, seed {trials["seed"]}
 * simulator: {protocol["trial"]["simulator"]}, friction {protocol["trial"]["friction"]:g}
-* made with {versions}
+* planned on {asked["device"]}, made with {versions}
 
 | status of a job | jobs | meaning |
 | --- | --- | --- |

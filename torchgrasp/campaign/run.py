@@ -1,12 +1,13 @@
 """A campaign on a folder of objects: from views to a data set of grasps on disk."""
 
 import dataclasses
-from collections.abc import Callable, Generator, Sequence
+import itertools
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from torchgrasp.base import Value
-from torchgrasp.campaign.cluster import empty_shard, run_job, run_on_cluster, versions
+from torchgrasp.campaign.cluster import OnGpu, empty_shard, plan_jobs, run_job, run_on_cluster, versions
 from torchgrasp.campaign.folder import Campaign, carry_out
 from torchgrasp.checks import Range, checked
 from torchgrasp.data.manifest import read_entries
@@ -33,6 +34,8 @@ class CampaignSpec(Value):
         trials: which views are planned on, and how many of their grasps are tried, with the hand's own fingers.
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
         jobs_in_shard: number of jobs (an object and a view) in one file.
+        device: "cuda" plans on all views of a file at once, on the workers of a Dask cluster that have a GPU and the
+            resource "GPU". A GPU's rounding may change grasps.
 
     Raises:
         BadArgument: an unknown protocol, or trials of whole clouds, of grasps that were planned before, or of other
@@ -46,6 +49,7 @@ class CampaignSpec(Value):
     trials: EvaluationSpec = dataclasses.field(default_factory=EvaluationSpec)
     licence: str = "unknown"
     jobs_in_shard: Annotated[int, Range(1, 10_000)] = 64
+    device: Literal["cpu", "cuda"] = "cpu"
 
     def __post_init__(self) -> None:
         """Raise `BadArgument` unless trials plan on partial views with default fingers, or for a bad licence."""
@@ -88,7 +92,8 @@ def run_campaign(
         observer: called with the row of each finished job.
 
     Raises:
-        BadArgument: no objects, no scheduler at the address, or a machine with other versions or another hand.
+        BadArgument: no objects, no scheduler at the address or for "cuda", or a machine with other versions or another
+            hand.
         OutputError: the folder holds another campaign or other files, another run holds it, or it cannot be written.
         MissingExtra: the simulator, pebble for workers, or Dask for a cluster is not installed.
 
@@ -105,6 +110,8 @@ def run_campaign(
     ([('tin', 'OK')], 1)
     """
     spec = CampaignSpec() if spec is None else spec
+    if spec.device != "cpu" and not isinstance(workers, str):
+        raise BadArgument("workers", workers, "a Dask scheduler, whose workers have the GPUs")
     place, test = Path(objects).resolve(), spec.test
     rows = _list_jobs(place, spec)
     of_hand = {"name": hand.name, "option": hand.source.option, "sha256": hand.source.sha256}
@@ -113,17 +120,25 @@ def run_campaign(
         "torchgrasp": "campaign", "version": 1, "licence": spec.licence,
         "objects_sha256": sha256(place / "manifest.json"), "hand": of_hand, "protocol": dataclasses.asdict(test),
         "trials": dataclasses.asdict(spec.trials), "jobs_in_shard": spec.jobs_in_shard, "versions": versions(),
+        "device": spec.device,
     }  # fmt: skip
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, hand, test.noise.draws))
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
+    views = [View(place, row.object, row.view, source) for row in rows]
     limit = PLAN_LIMIT + TRIAL_LIMIT * spec.trials.grasps * test.noise.draws
 
     def work(numbers: Sequence[int]) -> Generator[tuple[int, bytes | Status], None, None]:
-        views = [View(place, rows[j].object, rows[j].view, source) for j in numbers]
-        tasks = [(view, test, spec.trials, campaign.meta) for view in views]
         if isinstance(workers, str):
-            return run_on_cluster(run_job, tasks, workers, limit)
-        return run_as_they_end(run_job, tasks, workers, limit)
+            return run_on_cluster(run_job, tasks(numbers), workers, limit)
+        return run_as_they_end(run_job, tasks(numbers), workers, limit)
+
+    def tasks(numbers: Sequence[int]) -> Iterator[tuple[Any, ...]]:
+        size, meta = spec.jobs_in_shard, campaign.meta
+        for k, own in itertools.groupby(numbers, lambda j: j // size):
+            shard = [j for j in range(k * size, min((k + 1) * size, len(rows))) if rows[j].status is Status.OK]
+            plan = OnGpu(plan_jobs, (meta, [views[j] for j in shard], test, spec.trials, spec.device))
+            for j in own:  # a shard has one plan, whichever of its jobs are left
+                yield views[j], test, spec.trials, meta, None if spec.device == "cpu" else plan, shard.index(j)
 
     return carry_out(campaign, Path(folder), work, observer)
 

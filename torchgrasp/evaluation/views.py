@@ -1,12 +1,16 @@
 """One view of a dataset object: plans grasps on it, and tries them under a protocol on the true mesh."""
 
+import contextlib
 import dataclasses
 import functools
+import logging
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -120,31 +124,57 @@ class PlannedView(NamedTuple):
     grasps: Grasps | None = None
 
 
-def plan_view(view: View, protocol: Protocol, spec: EvaluationSpec, planned: Path | None = None) -> PlannedView:
-    """Plan grasps for a protocol on a view, or read the grasps of an earlier call from the file `planned`."""
+def plan_views(views: Sequence[View], protocol: Protocol, spec: EvaluationSpec, device: str) -> list[Grasps | None]:
+    """Plan on several views at once on a device; return the executable grasps of each, or None, for `plan_view`."""
+    clouds, planned, where = dict[int, PointCloud](), dict[int, Grasps](), torch.device(device)
+    for k, view in enumerate(views):
+        with contextlib.suppress(GraspError):  # which `plan_view` meets again
+            clouds[k] = read_view(view.objects, view.object, view.view).to(where)
+    name = torch.cuda.get_device_name(where) if where.type == "cuda" else device
+    try:
+        for k, found in zip(clouds, _plan(list(clouds.values()), views[0], protocol, spec), strict=True):
+            good = dataclasses.replace(found, meta=found.meta | {"device": name})
+            planned[k] = good[found.status == Status.OK].to("cpu")
+    except Exception as error:  # of the library: a cloud that breaks it costs no other its grasps
+        logging.getLogger(__name__).warning("%d views are planned one by one: %s", len(views), error)
+    return [planned.get(k) for k in range(len(views))]
+
+
+def _plan(cloud: Any, view: View, protocol: Protocol, spec: EvaluationSpec, **more: Any) -> Any:
+    """Plan grasps on the cloud of a view, or on several clouds."""
     most_friction = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
+    contacts = ContactSpec(friction=min(protocol.trial.friction, most_friction), table=Plane.horizontal(0.0))
+    more |= {"fingers": spec.fingers, "task": protocol.task}
+    return plan_grasps(cloud, view.load_hand(), contacts, spec.starts, spec.seed, **more)
+
+
+def plan_view(
+    view: View, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
+) -> PlannedView:
+    """Plan grasps for a protocol on a view, or take those that are `planned`, in a file or by `plan_views`.
+
+    If `plan_views` found none, the view is planned anew, to say why.
+    """
     hand, score, started = view.load_hand(), view.score, time.process_time()
     try:
         mesh, _ = _read_solid(view.objects, view.object)  # a bad mesh is refused before planning; its parts are cached
         cloud = read_view(view.objects, view.object, view.view)
         check_mesh(cloud, mesh)
         check_stand(mesh, Plane.horizontal(0.0))
-        if planned is not None:
+        if isinstance(planned, Path):
             return _read_planned(planned, score, cloud, hand)
         started = time.process_time()
-        contacts = ContactSpec(friction=min(protocol.trial.friction, most_friction), table=Plane.horizontal(0.0))
         stages: dict[str, Any] = {}
-        found = plan_grasps(
-            cloud, hand, contacts, spec.starts, spec.seed, fingers=spec.fingers, task=protocol.task,
-            observer=lambda name, _, value: stages.setdefault(name, value),
-        )  # fmt: skip
+        found = planned or _plan(
+            cloud, view, protocol, spec, observer=lambda name, _, value: stages.setdefault(name, value)
+        )
     except (MissingExtra, OutputError):
         raise
     except GraspError as error:
         note, spent = " ".join(str(error).split()), time.process_time() - started
         return PlannedView(dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=note, seconds=spent))
-    grasps, starts = found[found.status == Status.OK], stages["plan"].status
-    failed = count_status(found.status if len(found) else starts[starts != Status.OK])
+    grasps, status = found[found.status == Status.OK], found.status if len(found) else stages["plan"].status
+    failed = count_status(status[status != Status.OK])
     refusal = Status.OK if len(grasps) else next(iter(failed), Status.OUT_OF_REACH)
     score = dataclasses.replace(
         score, executable=len(grasps), refusal=refusal, fingers=found.meta["finger_names"],

@@ -54,12 +54,8 @@ def _plan_together(requests: Sequence[Request]) -> list[Grasps]:
     """Plan requests that differ in their clouds alone: one after another, or in stacks where an accelerator plans."""
     most = 256  # clouds at once: with more, their rows hardly fit into the memory
     devices = {request.cloud.points.device for request in requests if isinstance(request.cloud, PointCloud)}
-    if (
-        len(devices) != 1
-        or devices == {torch.device("cpu")}
-        or requests[0].mode != "joint"
-        or len(requests[0].hands) > 1
-    ):
+    one = len(devices) == 1 and torch.device("cpu") not in devices
+    if not one or requests[0].mode != "joint" or len(requests[0].hands) > 1:
         return [_plan_or_refuse(request) for request in requests]
     return [grasps for k in range(0, len(requests), most) for grasps in plan_stack(requests[k : k + most], *devices)]
 

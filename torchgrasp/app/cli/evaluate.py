@@ -174,6 +174,9 @@ class Campaign(_Trials):
     workers: Annotated[int, Range(0, 1024)] = option(
         1, "processes here, 0: this one; the data do not depend on their number"
     )
+    device: Literal["cpu", "cuda"] = option(
+        "cpu", 'with "cuda" the workers of --scheduler that have the resource "GPU" plan on all views of a file at once'
+    )
     scheduler: str | None = option(None, "Dask scheduler, as tcp://10.0.0.1:8786, whose workers do the jobs instead")
 
     def run(self) -> int:
@@ -184,7 +187,7 @@ class Campaign(_Trials):
         hand, _ = load_fingers(self.hand, self.fingers)
         trials = EvaluationSpec(self.grasps, self.ranks, self.starts, only=self.only, seed=self.seed, views=self.views)
         test = find_protocol(self.protocol).with_trial(**self.trial())
-        spec = CampaignSpec(test, trials, self.licence, self.jobs_in_shard)
+        spec = CampaignSpec(test, trials, self.licence, self.jobs_in_shard, self.device)
         source, name = (self.workers, "--workers") if self.scheduler is None else (self.scheduler, "--scheduler")
         with naming(workers=name), make_bar(len(list_names(self.objects, trials)), "job") as bar:
 
