@@ -2,7 +2,7 @@
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
 close  misplaced, sensors, perturb, table-lift, holding, speed, success: closing and lifting in simulation
-gpu    kernels, clouds, launches: kernels on a GPU beside the CPU; many clouds at once; launches, counted without a GPU
+gpu    kernels, clouds, launches, pulls: kernels beside the CPU; many clouds and trials at once; launches, without a GPU
 hand   fk, collision, codes, em: kinematics beside pytorch-kinematics, self-collision, inverse kinematics, learning
 load   plans, trials, points, starts: memory over many plans and trials, and of large inputs
 plan   truth, fields, executable, certificates: the contact planner on the true surface and in exact arithmetic

@@ -23,6 +23,8 @@ from torchgrasp.threads import single_threaded
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """Directions of the pulls: -x, +x, -y, +y, -z, +z of the world."""
 
+INTERVAL = 0.2  # interval [s] at which the pulled object's motion is checked
+
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -93,11 +95,10 @@ def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
 
 def _pull(run: TrialRun, spec: PullSpec, start: np.ndarray, direction: np.ndarray) -> tuple[Status, np.ndarray]:
     """Pull in one direction; return status and largest motion [m, rad] from the pose `start`."""
-    interval = 0.2  # interval [s] at which the pulled object's motion is checked
     run.scene.pull(spec.acceleration * run.mass * direction)
     status, largest = Status.OK, np.zeros(2)
-    for _ in range(round(spec.seconds / interval)):
-        run.hold(interval)
+    for _ in range(round(spec.seconds / INTERVAL)):
+        run.hold(INTERVAL)
         status, motion = _look(run, spec, start)
         largest = np.maximum(largest, motion)
         if status is not Status.OK:

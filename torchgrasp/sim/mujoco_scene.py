@@ -36,31 +36,45 @@ class MujocoScene(Scene):
 
     def __init__(self, spec: SceneSpec) -> None:
         super().__init__(spec)
-        self._mujoco = mujoco = _import_mujoco()
+        self._mujoco = mujoco = import_mujoco()
         text = scene_mjcf(spec)
         try:
             self.model = model = mujoco.MjModel.from_xml_string(text)
         except ValueError as error:
             raise HandFileError("urdf", f"{spec.urdf_path}: {error}", "a hand that MuJoCo can simulate") from error
-        self.data = data = mujoco.MjData(model)
+        self.data = mujoco.MjData(model)
         self.body = model.body(OBJECT).id
         urdf = spec.urdf
         self.joint_names = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")
         self._positions = np.array([model.joint(name).qposadr[0] for name in self.joint_names])
         self._velocities = np.array([model.joint(name).dofadr[0] for name in self.joint_names])
-        self._motors = np.array([model.actuator(name).id for name in self.joint_names])
+        self.motors = np.array([model.actuator(name).id for name in self.joint_names])
         self.root = model.body(urdf.root).id
         self.tips = [model.body(name).id for name in spec.tip_links]
         self.neighbours = [model.body(NEIGHBOUR.format(k)).id for k in range(len(spec.neighbours))]
         self._body_of, self._wrench = model.geom_bodyid.tolist(), np.zeros(6)
         parents = model.body_parentid.tolist()
         self._map_contacts([0], (parents[tip] if model.body_jntnum[tip] == 0 else None for tip in self.tips))
+        self._begin()
+
+    def _begin(self) -> None:
+        """Set joints and mount to the start, with their targets."""
+        data, spec = self.data, self.spec
         data.qpos[self._positions] = [spec.joints[name] for name in self.joint_names]
         self.drive(data.qpos[self._positions])
         for slide in spec.slides:
-            data.qpos[model.joint(slide.name).qposadr[0]] = slide.start
+            data.qpos[self.model.joint(slide.name).qposadr[0]] = slide.start
             self._move_mount(slide.name, slide.start, 0.0)
-        mujoco.mj_step1(model, data)
+        self._mujoco.mj_step1(self.model, data)
+
+    def restart(self, spec: SceneSpec) -> None:
+        """Change to the start of another scene, which differs in joints and pose of the hand alone."""
+        self.spec, model, pose = spec, self.model, spec.world_from_hand
+        model.body_pos[self.root] = pose[:3, 3]
+        self._mujoco.mju_mat2Quat(model.body_quat[self.root], pose[:3, :3].ravel())
+        self._mujoco.mj_setConst(model, self.data)
+        self._mujoco.mj_resetData(model, self.data)
+        self._begin()
 
     def _advance(self) -> Iterator[tuple[int, int, tuple[int, np.ndarray, np.ndarray]]]:
         """Advance by one timestep; yield each pair of bodies that touch, with number, axes and place of the contact."""
@@ -110,7 +124,7 @@ class MujocoScene(Scene):
 
     def drive(self, targets: np.ndarray) -> None:
         """Set the target [rad] of every driven joint."""
-        self.data.ctrl[self._motors] = targets
+        self.data.ctrl[self.motors] = targets
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
         """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
@@ -152,7 +166,7 @@ class MujocoScene(Scene):
         self.data.ctrl[self.model.actuator(joint).id] = target + speed * MOUNT_DRIVE.kd / MOUNT_DRIVE.kp
 
 
-def _import_mujoco() -> Any:
+def import_mujoco() -> Any:
     """Import and return MuJoCo; its warnings are no longer written to a file, only counted."""
     try:
         import mujoco

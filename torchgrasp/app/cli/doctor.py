@@ -36,7 +36,7 @@ class Doctor(Command):
     """List installed and missing packages, with the command that installs each.
 
     The exit code is 1 if a simulator or a package is missing, even though planning needs no simulator. A missing Dask,
-    which only `campaign --scheduler` needs, does not change the exit code.
+    which only `campaign --scheduler` needs, or MuJoCo Warp does not change the exit code.
     """
 
     def run(self) -> int:
@@ -64,7 +64,8 @@ def find_parts() -> list[Finding]:
         Finding("GPU", gpu),
         *(_simulator(name) for name in SIMULATORS),
         *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
-        _dask(),
+        _optional("distributed", "`torchgrasp campaign --scheduler`", "cluster"),
+        _optional("mujoco-warp", "`pull_grasps`", "warp"),
     ]
 
 
@@ -110,11 +111,10 @@ def _package(name: str, fix: str = "pip install torchgrasp") -> Finding:
         return Finding(name, "missing", fix)
 
 
-def _dask() -> Finding:
-    """Return the version of Dask's scheduler, which only one command needs; a missing Dask is not a fault."""
-    need = "none; `torchgrasp campaign --scheduler` needs it: pip install 'torchgrasp[cluster]'"
-    found = _package("distributed")
-    return Finding(found.part, need) if found.fix else found
+def _optional(name: str, user: str, extra: str) -> Finding:
+    """Return the version of a package that only one function uses; a missing one is not a fault."""
+    found = _package(name)
+    return Finding(name, f"none; {user} needs it: pip install 'torchgrasp[{extra}]'") if found.fix else found
 
 
 def _simulator(name: Simulator) -> Finding:

@@ -143,6 +143,10 @@ class OpenLoopClosing:
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
+        return self.advance(period)
+
+    def advance(self, period: float) -> Float[Tensor, "*n j"]:
+        """Return the targets [rad] for the next tick of one hand, or of n hands if `poses` are those of n."""
         self.time += period
         progress = min(self.time / POSE_TIME, 2.0)
         self.done = self.time >= 2 * POSE_TIME - 0.5 * period
