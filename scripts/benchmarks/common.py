@@ -51,11 +51,12 @@ class Options:
         grasps: grasps of each view, the best or spread over all ranks.
         starts: random starts of the contact planner.
         batches: numbers of clouds of gpu/clouds and gpu/launches.
+        gpu_rate: clouds that one GPU plans in a second, for load/campaign; gpu/clouds measures it. By default unknown.
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
         draws: trials of each grasp of close/table-lift, with other displacements, pushes and noise.
         tries: largest number of grasps that a trial of close/table-lift tries; by default as the protocol says.
         planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they are planned and kept.
-        simulator: of load/trials and close/table-lift.
+        simulator: of load/trials, load/campaign and close/table-lift.
         workers: processes that share the trials.
         threads: of torch.
         seed: of every random number.
@@ -73,6 +74,7 @@ class Options:
     grasps: int = 1
     starts: int = 1000
     batches: tuple[int, ...] = (1, 4, 16)
+    gpu_rate: float | None = None
     scale: float = 1.0
     draws: int = 5
     tries: int | None = None

@@ -20,6 +20,7 @@ from benchmarks.common import Options, benches_of, measure
 from benchmarks.gpu.compare import bench_kernel
 from benchmarks.gpu.kernels import kernels
 from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
+from benchmarks.load.campaign import Rates
 from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
 from benchmarks.shape.accuracy import find_edges, mean_row, measure_shape
 from benchmarks.shape.walls import measure_walls
@@ -34,11 +35,12 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import solve_closure_lp, wrenches
 
-RUNS = ("gpu/launches", "hand/collision", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
+RUNS = ("gpu/launches", "hand/collision", "load/scheduler", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
+SIMULATED = ("close/perturb", "load/campaign")
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", [*RUNS, pytest.param("close/perturb", marks=pytest.mark.sim)])
+@pytest.mark.parametrize("name", [*RUNS, *(pytest.param(x, marks=pytest.mark.sim) for x in SIMULATED)])
 def test_bench_writes_its_rows(name, tin, tmp_path):
     subject, short = name.split("/")
     options = Options(
@@ -51,6 +53,13 @@ def test_bench_writes_its_rows(name, tin, tmp_path):
     assert [row["what"] for row in written["rows"]] == [row.what for row in rows]
     table = (tmp_path / "out" / f"{subject}-{short}.md").read_text()
     assert "Commit " in table and table.count("\n| ") == len(rows) + 2
+
+
+def test_a_fleet_is_as_fast_as_its_slower_part():
+    """A core plans 3 s and tries 20 grasps of half a second; a core beside a GPU only tries."""
+    rates = Rates(3.0, 0.5, 20.0, *[0.0] * (len(Rates._fields) - 3))
+    assert rates.views_per_hour(13) == pytest.approx(3600) and rates.views_per_hour(10, 1, 100.0) == pytest.approx(3600)
+    assert rates.views_per_hour(160, 1, 2.0) == pytest.approx(7200) == rates.views_per_hour(160, 2, 1.0)
 
 
 def test_kernels_of_the_gpu_bench_agree_with_themselves():
