@@ -4,8 +4,8 @@
 close  misplaced, sensors, perturb, table-lift, holding, speed, success: closing and lifting in simulation
 gpu    kernels, clouds, launches, pulls: kernels beside the CPU; many clouds and trials at once; launches, without a GPU
 hand   fk, collision, codes, em: kinematics beside pytorch-kinematics, self-collision, inverse kinematics, learning
-load   plans, trials, points, starts, campaign, scheduler: memory over many plans and trials and of large inputs; what a
-       million views cost, and Dask's scheduler with a thousand workers, some of which die
+load   plans, trials, points, starts, campaign, scheduler, waiting: memory over many plans and trials, of large inputs;
+       what a million views cost; Dask's scheduler with a thousand workers, some of which die, and with waiting jobs
 plan   truth, fields, executable, certificates: the contact planner on the true surface and in exact arithmetic
 scene  plane, click, rooms, real, whole, clutter, clear: depth images, and lifts among neighbours
 shape  objects, weaker: the estimated shape against true meshes

@@ -35,7 +35,16 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import solve_closure_lp, wrenches
 
-RUNS = ("gpu/launches", "hand/collision", "load/scheduler", "load/starts", "plan/truth", "scene/plane", "scene/rooms")
+RUNS = (
+    "gpu/launches",
+    "hand/collision",
+    "load/scheduler",
+    "load/starts",
+    "load/waiting",
+    "plan/truth",
+    "scene/plane",
+    "scene/rooms",
+)
 SIMULATED = ("close/perturb", "load/campaign")
 
 

@@ -6,6 +6,7 @@ import gc
 import json
 import tempfile
 import time
+import tracemalloc
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -86,34 +87,30 @@ def scheduler(o: Options) -> list[Row]:
             f"{memory[-1] - memory[0]:+.0f} MiB; at most {max(held)} tasks at once", None,
             {"memory": memory, "held": max(held)},
         ),
-        waiting(max(100, o.times(OUTSTANDING))),
     ]  # fmt: skip
 
 
-def waiting(count: int) -> Row:
-    """Return the memory of jobs that wait on a scheduler without workers, in the client and the scheduler."""
-    meta, protocol, spec = (
-        {"campaign": "0" * 64, "versions": json.dumps(versions())},
-        PROTOCOLS["tabletop"],
-        EvaluationSpec(),
-    )
-    views = (View(Path("objects"), f"thing{j:06}", "view0", barrett().source) for j in range(count))
+@bench("load/waiting")
+def waiting(o: Options) -> list[Row]:
+    """Submit jobs to a scheduler without workers; count the memory of Python objects in client and scheduler."""
+    count, spec, protocol = max(100, o.times(OUTSTANDING)), EvaluationSpec(), PROTOCOLS["tabletop"]
+    meta = {"campaign": "0" * 64, "versions": json.dumps(versions())}
+    views = [View(Path("objects"), f"thing{j:06}", "view0", barrett().source) for j in range(count)]
     with swarm(0) as cluster, Client(cluster, set_as_default=False) as client:
         gc.collect()
-        before, futures = resident_mib(), list[Any]()
-        _, seconds = timed(
-            lambda: futures.extend(client.submit(run_job, x, protocol, spec, meta, pure=False) for x in views)
-        )
+        tracemalloc.start()
+        futures = [client.submit(run_job, view, protocol, spec, meta, pure=False) for view in views]
         while outstanding(cluster) < count:
             time.sleep(0.05)
         gc.collect()
-        each = (resident_mib() - before) / count
+        each = tracemalloc.get_traced_memory()[0] / count
+        tracemalloc.stop()
         client.cancel(futures)
     text = (
-        f"{1024 * each:.1f} KiB each, so {each * OUTSTANDING:.0f} MiB for the {OUTSTANDING} that may wait,"
-        f" and {each * MILLION / 1024:.0f} GiB for a million"
+        f"{each / 1024:.1f} KiB each, so {each * OUTSTANDING / 2**20:.0f} MiB for the {OUTSTANDING} that may wait,"
+        f" and {each * MILLION / 2**30:.1f} GiB for a million"
     )
-    return Row(f"memory of {count} waiting jobs", "-", text, None, {"kib": 1024 * each, "seconds": seconds})
+    return [Row(f"memory of {count} waiting jobs", "-", text, None, {"bytes": each})]
 
 
 def stub(number: int, row: JobRow, meta: dict[str, str], alone: bool = False) -> bytes:
