@@ -16,6 +16,7 @@ from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import LEAST_WIDTH, find_supports
+from torchgrasp.lazy import spatial
 from torchgrasp.values import PointCloud
 
 FEWEST = 50  # fewest points that show whether a camera is right, or whether pixels fly off rims
@@ -165,10 +166,8 @@ def judge_pixels(cloud: PointCloud, viewpoint: Vector) -> list[Advice]:
     inlier = find_inliers(points)
     if bool(inlier.all()) or int(inlier.sum()) < FEWEST:
         return []
-    from scipy.spatial import KDTree
-
     stray = points[~inlier]
-    _, index = KDTree(points[inlier].numpy()).query(stray.numpy())
+    _, index = spatial.KDTree(points[inlier].numpy()).query(stray.numpy())
     away = stray - points[inlier][torch.from_numpy(index)]
     along = (unit(away) * unit(stray - viewpoint.double())).sum(-1).abs()
     flying = float((along > 0.8).double().sum()) / len(points)

@@ -1,7 +1,5 @@
 """Checks that the cloud, mesh, contacts and table of one object do not contradict each other."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,10 +9,8 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
+from torchgrasp.lazy import trimesh
 from torchgrasp.values import PointCloud
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 def check_agreement(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -15,10 +15,8 @@ from torchgrasp.cloud.pose import check_rigid
 from torchgrasp.cloud.sensor import SensorName, SensorNoise, add_noise, find_sensor
 from torchgrasp.errors import MeshError
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
+from torchgrasp.lazy import trimesh
 from torchgrasp.values import PointCloud
-
-if TYPE_CHECKING:
-    import trimesh
 
 Image = Float[Tensor, "h w"]
 Transform = Float[Tensor, "4 4"]

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchgrasp.checks import Range, checked
 from torchgrasp.cloud.neighbours import find_inliers
 from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.lazy import spatial
 from torchgrasp.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.values import PointCloud
 
@@ -125,15 +126,13 @@ def _guess_unit(extent: float) -> str:
 
 def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
     """Return the indices of the distinct points, ascending; of coincident points only the first counts."""
-    from scipy.spatial import KDTree
-
     points = points.detach().double()
     low = points.amin(0)
     tolerance = 1e-9 * float((points.amax(0) - low).max())  # above rounding, below any sensor's resolution
     # Points that share a cell of half the tolerance coincide: one point a cell leaves few pairs among many copies.
     _, group = torch.unique(torch.floor((points - low) / (tolerance / 2)), dim=0, return_inverse=True)
     rows = first_of_each(group).sort().values
-    pairs = KDTree(points[rows].cpu().numpy()).query_pairs(tolerance, output_type="ndarray")
+    pairs = spatial.KDTree(points[rows].cpu().numpy()).query_pairs(tolerance, output_type="ndarray")
     keep = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
     keep[torch.from_numpy(pairs[:, 1]).to(rows.device)] = False  # the first index of a pair is the smaller one
     return rows[keep]

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.lazy import spatial
 
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
@@ -24,11 +25,9 @@ def nearest(
 
     Each point itself comes first in its row. A cloud of fewer than k points gives fewer columns.
     """
-    from scipy.spatial import KDTree
-
     array = points.detach().cpu().numpy()
     asked = array if rows is None else array[rows.cpu().numpy()]
-    distance, index = KDTree(array).query(asked, k=min(k, len(array)))
+    distance, index = spatial.KDTree(array).query(asked, k=min(k, len(array)))
     return torch.from_numpy(distance).to(points), torch.from_numpy(np.asarray(index, dtype=np.int64)).to(points.device)
 
 

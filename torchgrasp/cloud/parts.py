@@ -13,6 +13,7 @@ from torchgrasp.errors import NoSupport, TooFewPoints
 from torchgrasp.geometry.linalg import number_components
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support, find_supports
+from torchgrasp.lazy import spatial
 from torchgrasp.values import PointCloud
 
 LAYER = 0.004  # least half thickness [m] of a support's layer, for the noise of a depth camera at half a metre
@@ -21,15 +22,13 @@ GAP = 0.04  # least distance [m] between bodies; a bent or hidden surface of one
 
 def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, "n"]:
     """Return the group number of each point; groups are more than `gap` [m] apart, and group 0 is the largest."""
-    from scipy.spatial import KDTree
-
     device, points = points.device, points.cpu()
     # One point of each cell of a quarter of the gap, so that dense clouds have few pairs.
     cells = torch.floor((points - points.amin(0)) / (gap / 4)).long()
     size = cells.amax(0) + 1
     _, group = torch.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_inverse=True)
     first = first_of_each(group)
-    pairs = KDTree(points[first].numpy()).query_pairs(gap, output_type="ndarray")
+    pairs = spatial.KDTree(points[first].numpy()).query_pairs(gap, output_type="ndarray")
     label = number_components(pairs, len(first))[group.numpy()]
     order = np.argsort(np.argsort(-np.bincount(label), kind="stable"), kind="stable")
     return torch.from_numpy(order[label]).to(device)

@@ -6,6 +6,7 @@ import numpy as np
 
 from torchgrasp.cloud.tables import read_table
 from torchgrasp.geometry.mesh import load_triangles
+from torchgrasp.lazy import trimesh
 from torchgrasp.limits import CLOUD_POINTS, TEXT_MESH_BYTES
 
 TYPES = {
@@ -103,8 +104,6 @@ def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple
 
 def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
     """Return points on the surface of a PLY file's mesh, and their normals; None if the mesh is not closed."""
-    import trimesh
-
     try:
         mesh = load_triangles(data, ".ply", process=False)
     except Exception as error:  # the parser raises whatever the bytes provoke

@@ -15,6 +15,7 @@ from torchgrasp.base import Value
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.lazy import ndimage, optimize
 
 SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 """Depth cameras with a model of their noise."""
@@ -82,13 +83,11 @@ def add_noise(
     sensor: SensorNoise = ACTIVE_STEREO,
 ) -> Float[Tensor, "h w"]:
     """Return a depth image [m] with a camera's noise, given |cosine| between each ray and the surface normal."""
-    from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
-
     normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
     uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)
 
     def patches(std: float, width: float) -> Tensor:
-        field = torch.from_numpy(gaussian_filter(normal().numpy(), width))
+        field = torch.from_numpy(ndimage.gaussian_filter(normal().numpy(), width))
         return std * field / field.std()
 
     measured = depth > 0
@@ -101,13 +100,13 @@ def add_noise(
         noisy = noisy + sensor.sigma(noisy) * own
     noisy = noisy + patches(sensor.bias, sensor.bias_width)
     # A rim pixel has, within two pixels, background or a surface more than 10 mm away.
-    far = torch.from_numpy(maximum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
-    near = torch.from_numpy(minimum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
+    far = torch.from_numpy(ndimage.maximum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
+    near = torch.from_numpy(ndimage.minimum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
     rim = (far - depth > 0.010) | (depth - near > 0.010)
     flies = rim & (uniform() < sensor.flying)
     noisy = noisy + torch.where(flies, -sensor.flight * torch.log1p(-uniform()), 0.0)
     if sensor.multipath:  # light by way of the walls of a corner takes longer
-        around = torch.from_numpy(gaussian_filter(depth.numpy(), 8.0))
+        around = torch.from_numpy(ndimage.gaussian_filter(depth.numpy(), 8.0))
         excess = (depth - around).clamp_min(0.0)
         noisy = noisy + sensor.multipath * torch.where(excess < 0.01, excess, 0.0)
     angle = torch.rad2deg(torch.arccos(cosine.clamp(0.0, 1.0)))
@@ -129,8 +128,6 @@ def estimate_noise(
     The plane is in the camera's frame. Of the pixels `on_table`, those over 20 mm from the plane do not count. The
     noise is None if fewer than 1000 pixels show the table.
     """
-    from scipy.ndimage import uniform_filter
-
     patch, least = 21, 1000  # pixels
     row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
     x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
@@ -138,8 +135,8 @@ def estimate_noise(
     along = a * x + b * y[:, None] + c  # of a ray with depth 1 and the table's normal
     error = depth - table.offset / along
     on = on_table & (depth > 0) & ((error * along).abs() < 0.02)
-    share = torch.from_numpy(uniform_filter(on.double().numpy(), patch))
-    mean = torch.from_numpy(uniform_filter(torch.where(on, error, 0.0).numpy(), patch)) / share.clamp_min(1e-9)
+    share = torch.from_numpy(ndimage.uniform_filter(on.double().numpy(), patch))
+    mean = torch.from_numpy(ndimage.uniform_filter(torch.where(on, error, 0.0).numpy(), patch)) / share.clamp_min(1e-9)
     on = on & (share > 0.9)  # away from the feet of objects
     if int(on.sum()) < least:
         return None
@@ -150,15 +147,13 @@ def estimate_noise(
 
 def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoise:
     """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors [m] at given depths [m]."""
-    from scipy.optimize import nnls
-
     if len(depth) < 100:
         return SensorNoise()
     groups = torch.argsort(depth).tensor_split(8)
     middle = torch.stack([depth[rows].median() for rows in groups])
     variance = torch.stack([(1.4826 * error[rows].abs().median()).square() for rows in groups])
     terms = torch.stack([torch.ones_like(middle), middle**4], -1)
-    floor, growth = np.sqrt(nnls(terms.numpy(), variance.numpy())[0]).tolist()
+    floor, growth = np.sqrt(optimize.nnls(terms.numpy(), variance.numpy())[0]).tolist()
     return SensorNoise(floor=floor, growth=growth)
 
 

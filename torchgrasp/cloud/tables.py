@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import check_file, read_bytes
+from torchgrasp.lazy import Image
 from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS, JSON_BYTES, LINE_LETTERS, TEXT_COLUMNS, TOML_BYTES
 
 
@@ -163,8 +164,6 @@ def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tup
 
 def _parse_picture(data: bytes, colours: bool) -> np.ndarray:
     """Return the pixels of a PNG or TIFF image of one channel; if `colours`, several channels are allowed, too."""
-    from PIL import Image
-
     with Image.open(io.BytesIO(data), formats=("PNG", "TIFF")) as image:
         if colours and image.mode in ("P", "RGB", "RGBA"):  # the number of a palette's colour is the label
             return np.asarray(image)

@@ -10,6 +10,7 @@ from torchgrasp.cloud.neighbours import draw_rows, nearest
 from torchgrasp.errors import NoSupport
 from torchgrasp.geometry.linalg import Points, Vector, fibonacci_sphere, unit
 from torchgrasp.geometry.support import find_supports
+from torchgrasp.lazy import spatial
 
 MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
 """Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""
@@ -109,8 +110,6 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
 
     The second share is 1 if a point lies behind the camera.
     """
-    from scipy.spatial import KDTree
-
     ray = unit(points - viewpoint)
     edge_on = float(((ray * normals).sum(-1).abs() < 0.17).double().mean())  # the cosine of 80 degrees
     middle = (points.amax(0) + points.amin(0)) / 2
@@ -121,7 +120,7 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     local = (points - viewpoint) @ axes.T
     depth = local[:, 0].abs()
     pixels = (local[:, 1:] / depth[:, None]).cpu().numpy()
-    apart, index = KDTree(pixels).query(pixels, k=min(6, len(pixels)))
+    apart, index = spatial.KDTree(pixels).query(pixels, k=min(6, len(pixels)))
     # a point lies behind a neighbour if it is deeper by more than a slope explains
     step = (depth[:, None] - depth[torch.from_numpy(index).to(depth.device)]).abs()
     step = step - 2 * torch.from_numpy(apart).to(depth) * depth[:, None]

@@ -16,6 +16,7 @@ from torchgrasp.evaluation.regrasp import LiftTry
 from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.lazy import trimesh
 from torchgrasp.specs import TrialSpec
 
 CAUSES = {
@@ -53,8 +54,6 @@ def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> 
 
 def _sizes(lift: ClosureResult, trial: GraspTrial, spec: TrialSpec) -> Iterator[tuple[str, float, float]]:
     """Yield every cause of a lift, its size, and the size above which it applies; NaN if it cannot apply."""
-    from trimesh.proximity import closest_point
-
     mesh, truth = read_mesh(trial.truth.mesh), trial.truth
     up = torch.tensor([0.0, 0.0, 1.0]).double() if truth.table is None else truth.table.normal.double()
     centre, (touched, pressed) = torch.tensor(mesh.center_mass.tolist()).double(), (tick_of(lift, k) for k in (1, 2))
@@ -65,7 +64,7 @@ def _sizes(lift: ClosureResult, trial: GraspTrial, spec: TrialSpec) -> Iterator[
     yield "toppled", math.degrees(tilt), math.degrees(SLIP_ANGLE)
     yield "pushed away", 1e3 * float((closed - start).norm()), 1e3 * SLIP_DISTANCE
     yield "ejected", 1e3 * float((lifted - closed).norm()), 1e3 * SLIP_DISTANCE
-    off = 1e3 * closest_point(mesh, trial.grasp.contacts.points[0].double().numpy())[1]
+    off = 1e3 * trimesh.proximity.closest_point(mesh, trial.grasp.contacts.points[0].double().numpy())[1]
     yield "shape off", float(off.max()), 10.0
     missing = [finger for finger in range(len(off)) if finger not in lift.contact_order]
     yield "never met", float(off[missing].max()) if missing else math.nan, -1.0

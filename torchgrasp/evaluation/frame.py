@@ -1,7 +1,6 @@
 """The simulator's frame: its pose in the frame of a grasp, and grasps and meshes that are converted to it."""
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,10 +10,8 @@ from torch import Tensor
 from torchgrasp.geometry.frames import inverse, rigid
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import GRID, Plane, to_upright
+from torchgrasp.lazy import trimesh
 from torchgrasp.values import Grasps
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
@@ -50,7 +47,5 @@ def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
 def moved_mesh(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
     """Return a mesh, converted to the simulator's frame, with vertices rounded to multiples of `GRID`."""
-    import trimesh
-
     vertices = to_upright(torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)), obj_from_world)
     return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)

@@ -5,7 +5,6 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,13 +24,11 @@ from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
+from torchgrasp.lazy import trimesh
 from torchgrasp.sim.scene_spec import Neighbour
 from torchgrasp.specs import TrialSpec
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Grasps
-
-if TYPE_CHECKING:
-    import trimesh
 
 LIFT_TIME = 1.0  # time [s] in which the hand rises
 PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre during the closing that counts as ejected

@@ -25,6 +25,7 @@ from torchgrasp.export.other_formats import bench_frame
 from torchgrasp.files import Field, is_file, read_bytes, read_json
 from torchgrasp.geometry.frames import apply, rigid, rotate
 from torchgrasp.hand.hand import Hand
+from torchgrasp.lazy import spatial
 from torchgrasp.limits import CLOUD_BYTES
 from torchgrasp.plan.certify import certify
 from torchgrasp.specs import ContactSpec
@@ -148,14 +149,12 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
 
 def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
     """Return pose matrices from rows (g, 7) of a position [m] and a unit quaternion in the given order."""
-    from scipy.spatial.transform import Rotation
-
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
     far = np.abs(np.linalg.norm(turns, axis=1) - 1) > 1e-3  # more than the rounding of a file of few digits
     if far.any():
         length = float(np.linalg.norm(turns[far][0]))
         raise _refuse(f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}", "length 1")
-    matrices = Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
+    matrices = spatial.transform.Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
     return rigid(torch.tensor(matrices), torch.tensor(numbers[:, :3]))
 
 

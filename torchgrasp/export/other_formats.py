@@ -22,6 +22,7 @@ from torchgrasp.files import format_json, write_file
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import opened_pose
+from torchgrasp.lazy import matplotlib, spatial, trimesh
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values import Grasps
 
@@ -107,10 +108,9 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
 def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
     """Return the root link's pose in DexGraspBench's hand frame, and its joint order; identity and () if not known."""
-    from scipy.spatial.transform import Rotation
-
     turn, order = BENCH_HANDS.get(hand.name, ([0.0, 0.0, 0.0, 1.0], ()))
-    return rigid(torch.tensor(Rotation.from_quat(turn).as_matrix()), torch.zeros(3, dtype=torch.float64)), order
+    rotation = torch.from_numpy(spatial.transform.Rotation.from_quat(turn).as_matrix())
+    return rigid(rotation, torch.zeros_like(rotation[0])), order
 
 
 @checked
@@ -130,9 +130,6 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
     >>> save_surface(surface, Path(tempfile.mkdtemp(), "jug.ply")).stat().st_size > 10_000
     True
     """
-    import matplotlib
-    import trimesh
-
     path = check_surface_path(path)
     std = surface.std_m.detach().cpu().double().numpy()
     shares = np.clip(std / largest_std(surface), 0.0, 1.0)

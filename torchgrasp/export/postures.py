@@ -15,6 +15,7 @@ from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
+from torchgrasp.lazy import spatial
 from torchgrasp.sim.mujoco_scene import add_drive, add_links, format_numbers
 from torchgrasp.values import Grasps
 
@@ -111,9 +112,7 @@ def named_postures(
 
 def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:
     """Return the rotation of a pose as a unit quaternion (w, x, y, z)."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(a_from_b[:3, :3].double().cpu().numpy()).as_quat()
+    x, y, z, w = spatial.transform.Rotation.from_matrix(a_from_b[:3, :3].double().cpu().numpy()).as_quat()
     return [float(q) for q in (w, x, y, z)]
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.lazy import sparse
 from torchgrasp.marks import is_known
 
 Points = Float[Tensor, "n 3"]
@@ -36,11 +37,8 @@ def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[
 
 def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
     """Return the number, from 0, of the connected component of each of `count` nodes, given (e, 2) pairs of nodes."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(links, directed=False)[1]
+    links = sparse.coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return sparse.csgraph.connected_components(links, directed=False)[1]
 
 
 def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:

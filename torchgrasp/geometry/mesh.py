@@ -7,16 +7,14 @@ import re
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from torchgrasp.errors import MeshError, SuspiciousScale
 from torchgrasp.files import is_file, read_bytes
+from torchgrasp.lazy import trimesh
 from torchgrasp.limits import MAX_EXTENT, MESH_BYTES, MESH_FACES, MIN_EXTENT, PLY_HEADER_BYTES, PLY_PROPERTIES
-
-if TYPE_CHECKING:
-    import trimesh
 
 SUFFIXES = (".obj", ".off", ".ply", ".stl")  # formats whose memory is bounded by the size of the file
 
@@ -33,8 +31,6 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
             mesh has non-finite vertices, an open surface, faces that are not all turned outward, or no volume.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
     """
-    import trimesh
-
     name = "a mesh"
     if not isinstance(mesh, trimesh.Trimesh):
         if not is_file(mesh) or Path(mesh).suffix.lower() not in SUFFIXES:
@@ -137,8 +133,6 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
     """Return what `trimesh.load_mesh` reads from bytes; bad bytes and too many faces may raise any exception."""
-    import trimesh
-
     data = _geometry(data) if suffix == ".obj" else data
     if (faces := _count_faces(data, suffix)) > MESH_FACES:
         raise ValueError(f"a mesh of {faces} faces; at most {MESH_FACES}")

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.lazy import spatial
+
 NOISE, NOISE_GROWTH = 0.001, 0.0035
 """Assumed noise [m] of a depth camera, and its growth with the squared distance [1/m]."""
 ROUGH = 2.5  # a greater scale of the residuals, over the assumed noise, belongs to no flat plane
@@ -71,11 +73,9 @@ def fit_planes(view: View, generator: torch.Generator) -> Iterator[PlaneFit]:
 
 def _propose(view: View, scored: int, generator: torch.Generator) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
     """Return unit normals and offsets [m] of planes through random triples of points, distant or neighbouring."""
-    from scipy.spatial import KDTree
-
     points = view.points
     some = points[:scored]
-    near = torch.from_numpy(KDTree(some.numpy()).query(some.numpy(), min(60, len(some)))[1])
+    near = torch.from_numpy(spatial.KDTree(some.numpy()).query(some.numpy(), min(60, len(some)))[1])
     pick = torch.randint(near.shape[1], (2, len(some), 1), generator=generator, device="cpu")
     far = points[torch.randint(len(points), (3, 4000), generator=generator, device="cpu")]
     a, b, c = torch.cat([far, torch.stack([some, *(some[near.gather(1, k)[:, 0]] for k in pick)])], 1)

@@ -13,6 +13,7 @@ from torchgrasp.base import Value, kept
 from torchgrasp.checks import Range, check_tensor, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.mesh import closest_on_triangles
+from torchgrasp.lazy import spatial, trimesh
 
 BAND = 0.026  # distance [m] within which every second node is exact: the reach of a palm's spheres
 NEAR, INWARD = 3, 5  # spacings outside and inside the surface within which every node is exact
@@ -197,8 +198,6 @@ class _Surface:
     """The triangles of a mesh with a search tree over surface samples, to find the distances of points."""
 
     def __init__(self, vertices: Tensor, faces: Tensor):
-        from scipy.spatial import KDTree
-
         if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.is_floating_point():
             raise BadArgument("faces", f"{faces.dtype} of shape {tuple(faces.shape)}", "integers (f, 3) with f >= 1")
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -216,7 +215,7 @@ class _Surface:
         self.owner = np.concatenate([np.arange(len(area)), owner])
         self.triangles, self.normals = corners, _pseudonormals(corners)
         samples = np.concatenate([corners.mean(1), samples])
-        self.tree, self.few = KDTree(samples, leafsize=32), KDTree(samples[::FAR_SHARE], leafsize=32)
+        self.tree, self.few = spatial.KDTree(samples, leafsize=32), spatial.KDTree(samples[::FAR_SHARE], leafsize=32)
 
     def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
         """Return the signed distances [m] of points (n, 3); `far` uses fewer samples, for distant points."""
@@ -235,11 +234,9 @@ class _Surface:
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
     """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3 corners, (f, 7, 3)."""
-    from trimesh.grouping import unique_rows
-
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.linalg.norm(face, axis=1, keepdims=True)
-    ids = unique_rows(corners.reshape(-1, 3), digits=9)[1].reshape(-1, 3)
+    ids = trimesh.grouping.unique_rows(corners.reshape(-1, 3), digits=9)[1].reshape(-1, 3)
     ahead, back = np.roll(corners, -1, 1) - corners, np.roll(corners, 1, 1) - corners
     cosine = (ahead * back).sum(-1) / (np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1))
     weighted = face[:, None] * np.arccos(np.clip(cosine, -1, 1))[..., None]

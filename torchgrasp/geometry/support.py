@@ -14,6 +14,7 @@ from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.plane_fit import LEAST_SHARE, MOST_TILT, REACH, ROUGH, PlaneFit, View, assume_noise, fit_planes
+from torchgrasp.lazy import ndimage, spatial
 
 MOST_THROUGH = 0.1  # greatest number of points seen through a support's region, over the number on it
 MOST_PIERCED = 0.05  # greatest share of the low points over a support that continue below it
@@ -142,11 +143,9 @@ class Hull:
     @classmethod
     def of(cls, points: Float[Tensor, "n 2"]) -> "Hull":
         """Return the convex hull of points in a plane. If all points lie on a line, no point is inside the hull."""
-        from scipy.spatial import ConvexHull, QhullError
-
         try:
-            hull = ConvexHull(points.numpy())
-        except QhullError:
+            hull = spatial.ConvexHull(points.numpy())
+        except spatial.QhullError:
             return cls(points, points.new_tensor([[0.0, 0.0, math.inf]]))
         return cls(points[torch.from_numpy(hull.vertices).long()], torch.from_numpy(hull.equations))
 
@@ -162,14 +161,12 @@ class Hull:
 
 def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
     """Yield the connected groups of points in a plane, the largest first, without narrow strips and specks."""
-    from scipy.ndimage import binary_closing, binary_opening, label
-
     cells = torch.floor(flat / 0.03).long()
     cells = cells - cells.amin(0) + 3
     grid, box = np.zeros((cells.amax(0) + 4).tolist(), dtype=bool), np.ones((3, 3))
     grid[tuple(cells.T.numpy())] = True
     labels = np.empty(grid.shape, dtype=np.int32)
-    label(binary_opening(binary_closing(grid, box, iterations=2), box), output=labels)
+    ndimage.label(ndimage.binary_opening(ndimage.binary_closing(grid, box, iterations=2), box), output=labels)
     own = torch.from_numpy(labels[tuple(cells.T.numpy())]).long()
     count = torch.bincount(own)[1:]
     for k in torch.argsort(count, descending=True, stable=True).tolist():

@@ -6,6 +6,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchgrasp.geometry.linalg import number_components
+from torchgrasp.lazy import ndimage, spatial
 from torchgrasp.scene.image import DepthImage
 
 REACH = 0.012  # distance [m] on either side of a crease over which its angle is measured
@@ -13,8 +14,6 @@ REACH = 0.012  # distance [m] on either side of a crease over which its angle is
 
 def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
     """Cut each piece along its concave creases, and return an image of each pixel's part number, 0 for none."""
-    from scipy.ndimage import find_objects
-
     least = 300 * pieces.numel() / (640 * 480)  # pixels of the smallest part
     points = (image.points() - image.obj_from_camera[:3, 3]).numpy()  # from the camera, so that normals can face it
     parts, last = pieces.clone(), int(pieces.max())
@@ -22,7 +21,7 @@ def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h
     numbers = torch.zeros(last + 1, dtype=torch.int32)
     numbers[names[count >= 2 * least]] = torch.arange(1, 1 + int((count >= 2 * least).sum()), dtype=torch.int32)
     found = numbers[pieces].numpy()
-    boxes: list[tuple[slice, slice]] = find_objects(found)
+    boxes: list[tuple[slice, slice]] = ndimage.find_objects(found)
     for number, box in enumerate(boxes, start=1):
         mask = found[box] == number
         scale = float(image.intrinsics[0, 0]) / float(image.depth[box][torch.from_numpy(mask)].median())
@@ -37,13 +36,11 @@ def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h
 
 def _divide(points: np.ndarray, mask: np.ndarray, reach: float, least: float) -> np.ndarray:
     """Return the part (1, 2, ...) of each pixel of a piece, 0 outside it; pixels on creases join the nearest part."""
-    from scipy.ndimage import binary_erosion, distance_transform_edt, label, uniform_filter
-
     step = max(2, round(reach))
     inside = (slice(step, -step), slice(step, -step))
     mask, points = np.pad(mask, step), np.pad(points, ((step, step), (step, step), (0, 0)))
-    share = np.maximum(uniform_filter(mask.astype(float), step | 1), 1e-9)
-    smooth = [uniform_filter(np.where(mask, points[..., k], 0.0), step | 1) / share for k in range(3)]
+    share = np.maximum(ndimage.uniform_filter(mask.astype(float), step | 1), 1e-9)
+    smooth = [ndimage.uniform_filter(np.where(mask, points[..., k], 0.0), step | 1) / share for k in range(3)]
     smooth = np.stack(smooth, -1)
     normal, known = _normals(smooth, mask, max(1, step // 2))
     crease = np.zeros_like(mask)
@@ -57,13 +54,13 @@ def _divide(points: np.ndarray, mask: np.ndarray, reach: float, least: float) ->
         ends = np.roll(known, after, (0, 1)) & np.roll(known, before, (0, 1))
         crease |= ends & (np.minimum(first, second) > 0.35) & (length < 4 * REACH)
     number = np.empty(mask.shape, dtype=np.int32)
-    label(binary_erosion(mask & ~crease, iterations=max(1, step // 3)), output=number)
+    ndimage.label(ndimage.binary_erosion(mask & ~crease, iterations=max(1, step // 3)), output=number)
     large = np.bincount(number.ravel()) >= least
     large[0] = False
     names: np.ndarray = np.where(large, np.cumsum(large), 0)[number]
     if large.sum() < 2:
         return mask[inside].astype(np.int64)
-    nearest = np.asarray(distance_transform_edt(names == 0, return_distances=False, return_indices=True))
+    nearest = np.asarray(ndimage.distance_transform_edt(names == 0, return_distances=False, return_indices=True))
     return np.where(mask, names[tuple(nearest)], 0)[inside]
 
 
@@ -90,11 +87,8 @@ def _borders(parts: np.ndarray) -> list[tuple[int, int]]:
 
 def _is_concave(parts: np.ndarray, points: np.ndarray, a: int, b: int) -> bool:
     """Return whether the surfaces of two parts, measured beside their border, meet at a concave angle."""
-    from scipy.ndimage import binary_dilation
-    from scipy.spatial import KDTree
-
     first, second = parts == a, parts == b
-    border = KDTree(points[first & binary_dilation(second)])
+    border = spatial.KDTree(points[first & ndimage.binary_dilation(second)])
     sides = []
     for side in (points[first], points[second]):
         distance = border.query(side, distance_upper_bound=0.025)[0]

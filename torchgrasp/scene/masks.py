@@ -12,6 +12,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support
+from torchgrasp.lazy import ndimage
 from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
 from torchgrasp.scene.segment import count_labels, on_surface, segment
 
@@ -201,9 +202,7 @@ def label_again(
 
 def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> Int[Tensor, "h w"]:
     """Return labels without the target, strips of its object around `mask`, and specks: these become 0."""
-    from scipy.ndimage import binary_dilation
-
-    about = torch.from_numpy(binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
+    about = torch.from_numpy(ndimage.binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
     rest = torch.where(target | (about & belongs[objects]), 0, objects)
     few = count_labels(rest, len(belongs)) < LEAST_PIXELS
     return torch.where(few[rest], 0, rest)

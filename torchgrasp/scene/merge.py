@@ -18,6 +18,7 @@ from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Hull
+from torchgrasp.lazy import spatial
 from torchgrasp.scene.image import DepthImage
 
 GAP, TOUCH, FAR = 0.008, 3, 0.05
@@ -28,8 +29,6 @@ NESTED = 0.4  # a body with this share of its points over the footprint of a lar
 
 def merge_pieces(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]) -> Tensor:
     """Return, for each piece number, the number of the piece's object; 0 for number 0 and for pieces of no object."""
-    from scipy.spatial import KDTree
-
     new, whole = torch.zeros(int(pieces.max()) + 1, dtype=torch.long), torch.bincount(pieces.reshape(-1))
     if len(whole) == 1:
         return new
@@ -40,7 +39,7 @@ def merge_pieces(image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, ju
     axes, points = torch.stack(across(table.normal.double()), -1), image.points()
     points = torch.cat([points @ axes, table.height(points)[..., None]], -1)  # z is the height above the table
     parts = points[thin > 0][order].split(count.tolist())
-    gap = _gaps([KDTree(part.numpy()) for part in parts])
+    gap = _gaps([spatial.KDTree(part.numpy()) for part in parts])
     large = [k for k in range(len(parts)) if len(parts[k]) >= 30]
     bodies = _joined([_Body((k,), parts[k], int(whole[names[k]])) for k in large], gap, floating[names].tolist())
     for number, body in enumerate(bodies, start=1):
@@ -61,13 +60,11 @@ def _thinned(image: DepthImage, pieces: Int[Tensor, "h w"], count: Int[Tensor, "
 
 def find_touching(image: DepthImage, labels: Int[Tensor, "h w"]) -> list[tuple[int, int]]:
     """Return the pairs of labels of objects that touch, so that the border between the objects is a guess."""
-    from scipy.spatial import KDTree
-
     names, points = labels[labels > 0].unique().tolist(), image.points()
     if len(names) < 2:
         return []
     labels = _thinned(image, labels, torch.bincount(labels.reshape(-1)))
-    gap = _gaps([KDTree(points[labels == k].numpy()) for k in names])
+    gap = _gaps([spatial.KDTree(points[labels == k].numpy()) for k in names])
     return [(names[a], names[b]) for a, b in itertools.combinations(range(len(gap)), 2) if gap[a, b] < 0.5 * GAP]
 
 

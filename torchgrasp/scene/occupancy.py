@@ -20,6 +20,7 @@ from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.lazy import ndimage
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.scene import Scene
 
@@ -85,8 +86,6 @@ class Shadows(Value):
 
 def cast_shadows(scene: Scene, target: int) -> Shadows:
     """Return which object hides the space behind each pixel; the scene is in the upright frame of the target."""
-    from scipy.ndimage import label
-
     image, (row, column) = scene.image, scene.pixels.unbind(-1)
     depth, owner = image.depth.double(), torch.full(image.depth.shape, -1, dtype=torch.int64)
     points = depth.new_full((*depth.shape, 3), torch.nan)
@@ -98,7 +97,7 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
         gap, nearest = find_nearest(own)
         # Masks are off by some pixels: unlabelled pixels near the target's, in the image and in depth, are its own.
         rim = loose & (gap <= 6) & ((depth - depth.reshape(-1)[nearest]).abs() <= 0.02)
-        numbered: Any = label((loose & ~rim).numpy())
+        numbered: Any = ndimage.label((loose & ~rim).numpy())
         parts = torch.from_numpy(numbered[0]).long()
         large = (torch.bincount(parts.reshape(-1)) >= 20)[parts]  # fewer are flying pixels
         owner = torch.where(rim, target, torch.where(loose, torch.where(large, -1 - parts, -1), owner))
@@ -109,9 +108,7 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
 
 def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
     """Return each pixel's distance [px] to the nearest pixel of a mask, and the flat index of that nearest pixel."""
-    from scipy.ndimage import distance_transform_edt
-
-    found: Any = distance_transform_edt(~pixels.numpy(), return_indices=True)
+    found: Any = ndimage.distance_transform_edt(~pixels.numpy(), return_indices=True)
     row, column = torch.from_numpy(found[1]).long()
     return torch.from_numpy(found[0]), row * pixels.shape[1] + column
 
@@ -127,8 +124,6 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
     * The point's distance from the object's front, over the object's visible depth.
     * The point's distance from the object's middle, over the object's width.
     """
-    from scipy.ndimage import maximum_filter
-
     own = shadows.points[(shadows.owner == owner) & torch.isfinite(shadows.points[..., 2])]
     toward = unit(shadows.image.obj_from_camera[:2, 3].double() - own[:, :2].mean(0))
     axes = torch.stack([toward, torch.stack([-toward[1], toward[0]])], -1)
@@ -145,7 +140,7 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
 
     top = own.new_full((int(count[0] * count[1]),), -1.0)
     top.scatter_reduce_(0, column(own[:, :2]), own[:, 2], "amax")
-    top = torch.from_numpy(maximum_filter(top.reshape(count.tolist()).numpy(), 3)).reshape(-1)
+    top = torch.from_numpy(ndimage.maximum_filter(top.reshape(count.tolist()).numpy(), 3)).reshape(-1)
 
     def mirrored(size: float) -> Float[Tensor, "n"]:
         middle = axes @ torch.stack([front - size / 2, (low[1] + high[1]) / 2])

@@ -9,6 +9,7 @@ from torchgrasp.cloud.sensor import fit_noise
 from torchgrasp.geometry.linalg import number_components
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support
+from torchgrasp.lazy import ndimage, spatial
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage, label_radii
 from torchgrasp.scene.merge import REACH, merge_pieces
@@ -64,12 +65,10 @@ def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
 
 def _smoothed(image: DepthImage, table: Plane) -> tuple[Tensor, Tensor]:
     """Return the mean height [m] of the 5 x 5 pixels around each pixel, and the least height of an object there."""
-    from scipy.ndimage import uniform_filter
-
     measured, height = image.depth > 0, table.height(image.points())
     near = measured & (height.abs() < 3 * BAND)  # at an object's foot, without its distant neighbours
-    share = torch.from_numpy(uniform_filter(near.double().numpy(), 5))
-    total = torch.from_numpy(uniform_filter(torch.where(near, height, 0.0).numpy(), 5))
+    share = torch.from_numpy(ndimage.uniform_filter(near.double().numpy(), 5))
+    total = torch.from_numpy(ndimage.uniform_filter(torch.where(near, height, 0.0).numpy(), 5))
     mean = torch.where(near, total / share.clamp_min(1e-9), height)
     squared = image.depth.square()
     flat = measured & (mean.abs() < BAND)
@@ -84,12 +83,10 @@ def _risen(smooth: DepthImage, table: Plane, mean: Tensor, threshold: Tensor) ->
 
 def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
     """Return a mask of pixels above the table and away from depth jumps; and, per pixel, the least depth jump [m]."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
     depth = smooth.depth
     jump = 0.006 + 2.0 * depth / float(smooth.intrinsics[0, 0])
-    farthest = torch.from_numpy(maximum_filter(torch.where(depth > 0, depth, 0.0).numpy(), 3))
-    nearest = torch.from_numpy(minimum_filter(torch.where(depth > 0, depth, 100.0).numpy(), 3))
+    farthest = torch.from_numpy(ndimage.maximum_filter(torch.where(depth > 0, depth, 0.0).numpy(), 3))
+    nearest = torch.from_numpy(ndimage.minimum_filter(torch.where(depth > 0, depth, 100.0).numpy(), 3))
     return risen & ~((farthest - depth > jump) | (depth - nearest > jump)), jump
 
 
@@ -109,15 +106,13 @@ def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]
 
 def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
     """Return labels in which pixels above the table without a label get that of the nearest point within `NEAR`."""
-    from scipy.spatial import KDTree
-
     labels = torch.where((count_labels(labels) < FEW)[labels], 0, labels).reshape(-1)
     place, loose = points.reshape(-1, 3).numpy(), torch.nonzero(risen.reshape(-1) & (labels == 0))[:, 0]
     new = torch.nonzero(labels)[:, 0]
     for _ in range(12):
         if not len(new) or not len(loose):
             break
-        distance, index = KDTree(place[new.numpy()]).query(place[loose.numpy()], distance_upper_bound=NEAR)
+        distance, index = spatial.KDTree(place[new.numpy()]).query(place[loose.numpy()], distance_upper_bound=NEAR)
         found = torch.from_numpy(np.isfinite(distance))
         labels[loose[found]] = labels[new[torch.from_numpy(index)[found]]]
         new, loose = loose[found], loose[~found]
@@ -126,18 +121,16 @@ def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
 
 def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h w"]:
     """Return labels in which the inner floor of an object, such as a pan, has the label of that object."""
-    from scipy.ndimage import binary_dilation, find_objects, label
-
     holes = np.empty(labels.shape, dtype=np.int32)
-    label((measured & (labels == 0)).numpy(), output=holes)
+    ndimage.label((measured & (labels == 0)).numpy(), output=holes)
     whole = labels.clone()
-    boxes: list[tuple[slice, slice]] = find_objects(holes)
+    boxes: list[tuple[slice, slice]] = ndimage.find_objects(holes)
     for number, box in enumerate(boxes, start=1):
         row, column = (slice(max(0, side.start - 2), side.stop + 2) for side in box)
         hole = torch.from_numpy(holes[row, column] == number)
         if int(hole.sum()) < FEW:
             continue
-        around = labels[row, column][torch.from_numpy(binary_dilation(hole.numpy(), iterations=2)) & ~hole]
+        around = labels[row, column][torch.from_numpy(ndimage.binary_dilation(hole.numpy(), iterations=2)) & ~hole]
         names = around[around > 0].unique()
         edge = bool(hole[0].any() | hole[-1].any() | hole[:, 0].any() | hole[:, -1].any())
         if len(names) == 1 and not edge and float(height[row, column][hole].median()) > 0.001:
@@ -166,16 +159,14 @@ def _is_noise(labels: Int[Tensor, "h w"], k: int, points: Tensor, pixel: Tensor,
 
     `pixel` is the width of each pixel on its surface [m]. `deviations` are heights above the table over the noise's.
     """
-    from scipy.ndimage import binary_dilation, distance_transform_edt
-
     mine = labels == k
     if float((deviations[mine] > 8).double().mean()) < 0.25:
         return True
     rows, columns = (slice(max(0, int(side.min()) - 4), int(side.max()) + 5) for side in torch.nonzero(mine).T)
     width, mine = float(pixel[mine].median()), mine[rows, columns]
     near, points = labels[rows, columns], points[rows, columns]
-    if width * float(np.max(np.asarray(distance_transform_edt(mine.numpy())))) > 0.005:
+    if width * float(np.max(np.asarray(ndimage.distance_transform_edt(mine.numpy())))) > 0.005:
         return False
-    around = torch.from_numpy(binary_dilation(mine.numpy(), iterations=4)) & (near > 0) & ~mine
+    around = torch.from_numpy(ndimage.binary_dilation(mine.numpy(), iterations=4)) & (near > 0) & ~mine
     around &= count_labels(labels)[near] > 10 * int(mine.sum())
     return bool(around.any()) and float(torch.cdist(points[around], points[mine]).min()) < REACH

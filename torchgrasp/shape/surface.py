@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -16,12 +16,10 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import Points, limit_norm, number_components, unit
 from torchgrasp.geometry.mesh import clip_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, SignedDistanceField, field_from_surface
+from torchgrasp.lazy import ndimage, spatial, trimesh
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.values import surface_deviation
 from torchgrasp.threads import single_threaded
-
-if TYPE_CHECKING:
-    import trimesh
 
 RESOLUTION = 48  # cells along the domain's diameter
 COARSE, STEEPER = 4, 1.3
@@ -50,8 +48,6 @@ class Surface(Value):
 
     def mesh(self) -> "trimesh.Trimesh":
         """Return vertices and faces as a trimesh mesh."""
-        import trimesh
-
         return trimesh.Trimesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy(), process=False)
 
 
@@ -145,8 +141,6 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
 
     Every node of a block is evaluated if the surface may cross the block; other nodes copy a node of a coarser grid.
     """
-    from scipy.ndimage import maximum_filter, minimum_filter
-
     line = -radius + step * torch.arange(cells + 1, dtype=torch.float64, device=shape.x.device)
 
     def mean(stride: int, nodes: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -157,11 +151,11 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     values = mean(stride, tuple(np.indices((count, count, count)).reshape(3, -1))).reshape((count,) * 3)
     steepest = STEEPER * max(float(np.abs(np.diff(values, axis=axis)).max()) for axis in range(3)) / (stride * step)
     while stride > 1:
-        least = minimum_filter(np.abs(values), 2, origin=-1)[:-1, :-1, :-1]  # over the corners of each cell
+        least = ndimage.minimum_filter(np.abs(values), 2, origin=-1)[:-1, :-1, :-1]  # over the corners of each cell
         near = (least < steepest * math.sqrt(0.75) * stride * step).repeat(2, 0).repeat(2, 1).repeat(2, 2)
         stride //= 2
         values = values.repeat(2, 0).repeat(2, 1).repeat(2, 2)[:-1, :-1, :-1]
-        wanted = np.nonzero(maximum_filter(np.pad(near, ((0, 1),) * 3), 2))  # the corners of those cells
+        wanted = np.nonzero(ndimage.maximum_filter(np.pad(near, ((0, 1),) * 3), 2))  # the corners of those cells
         values[wanted] = mean(stride, wanted)
     squares = (line * line).cpu().numpy()
     distance = squares[:, None, None] + squares[:, None] + squares
@@ -177,11 +171,9 @@ def newton_step(value: Float[Tensor, "n"], gradient: Points, longest: float, lea
 
 def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
     """Return a mask of the faces in connected pieces to which enough points of the cloud are nearest."""
-    from scipy.spatial import KDTree
-
     label = number_components(np.concatenate([faces[:, :2], faces[:, 1:]]), len(corners))
     cloud = shape.normalise(shape.cloud.points.to(shape.x)).cpu().numpy()
-    _, nearest = KDTree(corners).query(cloud)
+    _, nearest = spatial.KDTree(corners).query(cloud)
     share = np.bincount(label[nearest], minlength=label.max() + 1) / len(cloud)
     return (share >= min(LEAST_SHARE, share.max()))[label[faces[:, 0]]]
 

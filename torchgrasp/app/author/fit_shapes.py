@@ -8,7 +8,6 @@ import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -19,10 +18,8 @@ from torchgrasp.files import read_bounded
 from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.urdf import Shape, Urdf
+from torchgrasp.lazy import trimesh
 from torchgrasp.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACES
-
-if TYPE_CHECKING:
-    import trimesh
 
 MESH_KINDS = (".stl", ".obj", ".ply")  # formats of meshes that contain only geometry
 SAVING, SAVING_TIP = 0.12, 0.04
@@ -105,8 +102,6 @@ def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Point
 
 def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     """Read a mesh file, but no file that it refers to; return points on the mesh."""
-    import trimesh
-
     path = mesh_file(urdf, name, folder)
     data = read_bounded(path, MESH_BYTES, "a mesh", functools.partial(HandFileError, "urdf"))
     allowed = f"a triangle mesh of at most {MESH_FACES} faces"
@@ -121,21 +116,17 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
 
 
 def _primitive_points(shape: Shape) -> Points:
-    from trimesh import creation
-
     if shape.kind == "box":
-        return _sample(creation.box(shape.size))
+        return _sample(trimesh.creation.box(shape.size))
     if shape.kind == "sphere":
-        return _sample(creation.icosphere(3, shape.size[0]))
-    return _sample(creation.cylinder(shape.size[0], shape.size[1], sections=48))
+        return _sample(trimesh.creation.icosphere(3, shape.size[0]))
+    return _sample(trimesh.creation.cylinder(shape.size[0], shape.size[1], sections=48))
 
 
 def _sample(mesh: "trimesh.Trimesh") -> Points:
     """Return points on a mesh: random points of its surface, then some of its vertices."""
     count = 4000  # points on each shape
-    from trimesh.sample import sample_surface
-
-    points = np.asarray(sample_surface(mesh, count, seed=0)[0])
+    points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
     vertices = np.asarray(mesh.vertices)
     return np.concatenate([points, vertices[:: len(vertices) // count + 1]])
 
@@ -160,11 +151,9 @@ def fit_shapes(points: Points) -> list[Shape]:
 def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
     """Return the axes of the fitted boxes as columns: the axes of the link, unless rotated axes fit much better."""
     turned_share = 0.85  # a box is turned out of the link's axes if its volume falls below this share
-    from trimesh.bounds import oriented_bounds
-
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-7 * math.sqrt(len(points))) < 3:  # a flat body has no hull
         return np.eye(3)
-    turned, sizes = oriented_bounds(points)
+    turned, sizes = trimesh.bounds.oriented_bounds(points)
     straight = np.prod(np.ptp(points, axis=0))
     return turned[:3, :3].T if np.prod(sizes) < turned_share * straight else np.eye(3)
 

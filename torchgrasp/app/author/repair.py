@@ -12,6 +12,7 @@ import numpy as np
 
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.urdf import SIZES, Joint, Link, Mimic, Shape, Triple, Urdf
+from torchgrasp.lazy import trimesh
 
 EFFORT, VELOCITY = 1.0, 3.0  # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
 
@@ -20,17 +21,13 @@ Step = tuple[Urdf, list[str]]
 
 def pose_of(part: Joint | Shape) -> np.ndarray:
     """Return the 4 x 4 pose of a joint or a shape in the frame of its parent link."""
-    from trimesh.transformations import compose_matrix
-
-    return compose_matrix(angles=part.rpy, translate=part.xyz)
+    return trimesh.transformations.compose_matrix(angles=part.rpy, translate=part.xyz)
 
 
 def place(pose: np.ndarray) -> tuple[Triple, Triple]:
     """Return translation [m] and fixed-axis angles [rad] of a 4 x 4 pose."""
-    from trimesh.transformations import euler_from_matrix
-
     # the smaller of the two triples, rounded to the digits of a rotation, so that short numbers remain short
-    one = [float(angle) for angle in euler_from_matrix(pose)]
+    one = [float(angle) for angle in trimesh.transformations.euler_from_matrix(pose)]
     two = [math.copysign(math.pi, angle) - angle for angle in one]
     angles = min((one, (-two[0], two[1], -two[2])), key=lambda triple: sum(map(abs, triple)))
     x, y, z, roll, pitch, yaw = (float(x) + 0.0 for x in [*pose[:3, 3], *(round(angle, 15) for angle in angles)])
@@ -117,11 +114,9 @@ def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
 
 
 def _fixed(joint: Joint, value: float) -> Joint:
-    from trimesh.transformations import rotation_matrix, translation_matrix
-
-    move = translation_matrix(value * np.array(joint.axis))
+    move = trimesh.transformations.translation_matrix(value * np.array(joint.axis))
     if joint.kind != "prismatic":
-        move = rotation_matrix(value, joint.axis)
+        move = trimesh.transformations.rotation_matrix(value, joint.axis)
     xyz, rpy = place(pose_of(joint) @ move)
     return Joint(joint.name, "fixed", joint.parent, joint.child, xyz, rpy)
 

@@ -3,7 +3,7 @@
 import dataclasses
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import Command, Progress, arguments, naming, nested, option, positional
@@ -22,6 +22,7 @@ from torchgrasp.geometry.plane import as_plane
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
+from torchgrasp.lazy import trimesh
 from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
@@ -35,9 +36,6 @@ from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, TrialSpec
 from torchgrasp.success import GraspTask, explain_success
 from torchgrasp.values import Grasps, PointCloud, format_success
-
-if TYPE_CHECKING:
-    import trimesh
 
 Among = Literal["auto"] | None
 

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from torchgrasp.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
+
 Points = Float[np.ndarray, "n 3"]
 
 Direction = tuple[float, float, float]
@@ -65,9 +67,7 @@ class Canvas:
 
     def add_points(self, points: Points, colors: Points) -> None:
         """Add points as small balls, each in its colour."""
-        from trimesh import creation
-
-        ball = creation.icosphere(subdivisions=0, radius=0.006 * float(np.linalg.norm(np.ptp(points, axis=0))))
+        ball = trimesh.creation.icosphere(subdivisions=0, radius=0.006 * float(np.linalg.norm(np.ptp(points, axis=0))))
         n, k = len(points), len(ball.vertices)  # too small on the page for its faces to show
         faces = (k * np.arange(n)[:, None, None] + ball.faces).reshape(-1, 3)
         vertices = (points[:, None] + ball.vertices).reshape(-1, 3)
@@ -81,24 +81,20 @@ class Canvas:
         colors: tuple[str, ...],
     ) -> None:
         """Add arrows of one length [m] in unit directions, each with its colour and a small ball at its start."""
-        from trimesh import creation, geometry
-
-        head = creation.cone(radius=0.1, height=0.35, sections=8)
+        head = trimesh.creation.cone(radius=0.1, height=0.35, sections=8)
         head.apply_translation([0.0, 0.0, 0.65])
-        shaft = creation.cylinder(radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8)
+        shaft = trimesh.creation.cylinder(radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8)
         for start, direction, color in zip(points, directions, colors, strict=True):
-            turn = np.asarray(geometry.align_vectors([0.0, 0.0, 1.0], direction))[:3, :3]
-            for part in (creation.icosphere(subdivisions=1, radius=0.13), shaft, head):
+            turn = np.asarray(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], direction))[:3, :3]
+            for part in (trimesh.creation.icosphere(subdivisions=1, radius=0.13), shaft, head):
                 self.add_mesh(length * part.vertices @ turn.T + start, part.faces, color)
 
     def add_table(self, corners: Points, height: float | None) -> None:
         """Add an unshaded round table top at `height` [m], centred on `corners` in x and y. None adds nothing."""
-        from trimesh import creation
-
         if height is None:
             return
         radius = 0.55 * float(np.linalg.norm(np.ptp(corners[:, :2], axis=0))) + 0.02
-        top = creation.cylinder(radius, 1e-4, sections=120)
+        top = trimesh.creation.cylinder(radius, 1e-4, sections=120)
         center = np.append((corners[:, :2].min(0) + corners[:, :2].max(0)) / 2, height - 1e-3)
         self.add_mesh(top.vertices + center, top.faces, TABLE, lit=False)
 
@@ -108,8 +104,6 @@ class Canvas:
 
     def render_png(self, corners: Points, direction: Direction, bar: tuple[str, float, str] | None = None) -> bytes:
         """Return a PNG that shows all `corners` [m]; `bar` is title, largest value and colour map of a bar below."""
-        from PIL import Image
-
         image = Image.fromarray(self.render(frame_camera(corners, direction, 0.09 if bar else 0.0)))
         if bar:
             draw_bar(image, *bar)
@@ -140,8 +134,6 @@ def frame_camera(corners: Points, direction: Direction, drop: float = 0.0, size:
 
 def sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
     """Return a normal for each corner of each face; faces that bend by less than 40 degrees are one smooth surface."""
-    import trimesh
-
     smooth = trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, faces), np.deg2rad(40.0), facet_minarea=None)
     normals = np.empty((len(faces), 3, 3))
     normals[np.concatenate(smooth.metadata["original_components"])] = smooth.vertex_normals[smooth.faces]
@@ -241,15 +233,11 @@ def rgb(color: str) -> tuple[float, float, float]:
 
 def map_colors(values: Float[np.ndarray, " n"], name: str) -> Points:
     """Return the colours that the matplotlib colour map `name` gives to values in [0, 1]."""
-    import matplotlib
-
     return matplotlib.colormaps[name](values)[:, :3]
 
 
 def draw_bar(image: Any, title: str, most: float, colors: str) -> None:
     """Draw a titled colour bar from 0 to `most` at the bottom of a picture."""
-    from PIL import Image, ImageDraw, ImageFont
-
     width, height = image.size
     left, right, top, bottom = width // 5, width - width // 5, height - 24, height - 10
     ramp = map_colors(np.linspace(0.0, 1.0, right - left), colors)

@@ -1,6 +1,6 @@
 """A film strip of a simulated closing as one PNG: pictures of its key moments above plots over time."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,9 +14,7 @@ from torchgrasp.closure import ClosureResult
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.hand import Hand
-
-if TYPE_CHECKING:
-    import trimesh
+from torchgrasp.lazy import trimesh
 
 WIDTH, STILL, TITLE = 1680, 340, 44
 """Width of the strip, height of its stills with titles, and height of a title [pixels]."""

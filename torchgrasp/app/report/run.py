@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,14 +20,12 @@ from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
+from torchgrasp.lazy import trimesh
 from torchgrasp.planner.explain import Explanation
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import ContactPlan, Grasps, PointCloud
-
-if TYPE_CHECKING:
-    import trimesh
 
 LOST = "lost"  # name of the moment at which an object was lost
 

@@ -12,6 +12,7 @@ from torchgrasp.files import write_file
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
+from torchgrasp.lazy import Image, ImageDraw, ImageFont, ndimage
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.scene import Scene
 
@@ -42,9 +43,6 @@ def draw_scene(scene: Scene, path: Path | str) -> Path:
 
 def encode_scene(scene: Scene) -> bytes:
     """Return the picture of a scene as PNG, as `draw_scene` writes it."""
-    from PIL import Image
-    from scipy.ndimage import maximum_filter
-
     kinds, labels = sort_pixels(scene)
     h, w = labels.shape
     palette = np.stack([rgb(color) for color in (*KINDS.values(), *OBJECTS)])
@@ -55,7 +53,7 @@ def encode_scene(scene: Scene) -> bytes:
     color *= np.where(labels > 0, light, 0.6 + 0.4 * light)[..., None]  # relief matters most on objects
     if scene.table is not None:
         color *= 1 - 0.25 * np.where((labels == 0) & (kinds == 2), _squares(scene.image, scene.table), 0.0)[..., None]
-    whole = np.where(kinds > 0, labels, maximum_filter(labels, 5))  # single missing pixels have no rim
+    whole = np.where(kinds > 0, labels, ndimage.maximum_filter(labels, 5))  # single missing pixels have no rim
     color[_rim(whole, 3) & (labels > 0)] *= 0.5
     color[(labels == 0) & (kinds == 0)] = rgb(KINDS["not measured"])
     if scene.target is not None:
@@ -101,10 +99,8 @@ def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
 
 def _light(scene: Scene) -> Float[np.ndarray, "h w"]:
     """Return the brightness of each pixel: higher for faces towards the sky and the camera, lower far away."""
-    from scipy.ndimage import gaussian_filter
-
     depth, seen = scene.image.depth.double().numpy(), scene.image.depth.numpy() > 0
-    smooth, weight = gaussian_filter(depth, 1.5), gaussian_filter(seen.astype(float), 1.5)
+    smooth, weight = ndimage.gaussian_filter(depth, 1.5), ndimage.gaussian_filter(seen.astype(float), 1.5)
     smooth = np.where(weight > 0, smooth / weight.clip(1e-6), 1.0).clip(1e-3)
     down, right = (slope * float(scene.image.intrinsics[0, 0]) / smooth for slope in np.gradient(smooth))
     sky = np.array([0.0, -1.0, 0.0])
@@ -120,24 +116,19 @@ def _light(scene: Scene) -> Float[np.ndarray, "h w"]:
 
 def _rim(labels: np.ndarray, width: int) -> Bool[np.ndarray, "h w"]:
     """Return a mask of the pixels with another label in the square of `width` pixels around them."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
     whole = labels.astype(int)
-    return maximum_filter(whole, width) != minimum_filter(whole, width)
+    return ndimage.maximum_filter(whole, width) != ndimage.minimum_filter(whole, width)
 
 
 def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> None:
     """Write the label of each object into the picture, at the object's widest place."""
-    from PIL import Image, ImageDraw, ImageFont
-    from scipy.ndimage import distance_transform_edt
-
     assert isinstance(picture, Image.Image)
     pen = ImageDraw.Draw(picture)
     for label in np.unique(labels[labels > 0]).tolist():
         row, column = np.nonzero(labels == label)
         top, left = int(row.min()), int(column.min())
         body = np.pad(labels[top : row.max() + 1, left : column.max() + 1] == label, 1)
-        inside = np.asarray(distance_transform_edt(body))
+        inside = np.asarray(ndimage.distance_transform_edt(body))
         row, column = divmod(int(inside.argmax()), inside.shape[1])
         place = (scale * (left + column - 0.5), scale * (top + row - 0.5))
         font = ImageFont.load_default(float(np.clip(1.1 * scale * inside.max(), 24, 54)))
@@ -146,8 +137,6 @@ def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> No
 
 def _with_legend(picture: object, scene: Scene, kinds: Int[np.ndarray, "h w"]) -> object:
     """Return the picture with a legend below it: kinds of pixels, then height and distance of each object."""
-    from PIL import Image, ImageDraw, ImageFont
-
     assert isinstance(picture, Image.Image)
     shown = [(name, color) for k, (name, color) in enumerate(KINDS.items()) if (kinds == k).mean() > 0.002]
     entries = [*shown[::-1], *((_describe(scene, k), OBJECTS[(k - 1) % len(OBJECTS)]) for k in scene.things[:12])]

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgrasp.app.report.canvas import FINGERS, HAND
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import Shape, read_urdf
+from torchgrasp.lazy import spatial, trimesh
 
 PARKED = -1  # finger index of a link that no grasping finger owns, such as the palm
 EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot finger
@@ -77,11 +78,7 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
 @functools.lru_cache(maxsize=512)  # a hand is drawn many times
 def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, faces and vertex normals of a collision shape with rounded edges, in its link's frame."""
-    from scipy.spatial import ConvexHull
-    from trimesh import creation
-    from trimesh.transformations import euler_matrix
-
-    ball = np.asarray(creation.icosphere(subdivisions=3 if shape.kind == "sphere" else 1, radius=1.0).vertices)
+    ball = np.asarray(trimesh.creation.icosphere(subdivisions=3 if shape.kind == "sphere" else 1, radius=1.0).vertices)
     if shape.kind == "sphere":
         radius, centres = shape.size[0], np.zeros((1, 3))
     elif shape.kind == "box":
@@ -94,11 +91,11 @@ def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rim, up = (shape.size[0] - radius) * ball[:, 3], np.array([0.0, 0.0, shape.size[1] / 2 - radius])
         ball, centres = ball.reshape(-1, 3), np.concatenate([rim - up, rim + up])
     points, normals = (centres[:, None] + radius * ball).reshape(-1, 3), np.tile(ball, (len(centres), 1))
-    hull = ConvexHull(points)
+    hull = spatial.ConvexHull(points)
     kept, faces = np.unique(hull.simplices, return_inverse=True)
     points, normals, faces = points[kept], normals[kept], faces.reshape(-1, 3)
     a, b, c = points[faces].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0.0
     faces[inward] = faces[inward, ::-1]
-    place = euler_matrix(*shape.rpy, axes="sxyz")
+    place = trimesh.transformations.euler_matrix(*shape.rpy, axes="sxyz")
     return points @ place[:3, :3].T + np.array(shape.xyz), faces, normals @ place[:3, :3].T

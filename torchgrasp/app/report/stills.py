@@ -12,6 +12,7 @@ from torchgrasp.app.report.canvas import Direction
 from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
+from torchgrasp.lazy import Image
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values import Contacts, Grasps, PointCloud
@@ -71,7 +72,6 @@ def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direct
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
     """Return a PNG of a hand with pad normals and palm axes at a posture and both limits, and of the joint ranges."""
     from matplotlib.figure import Figure
-    from PIL import Image
 
     eye, bars = (1.0, -0.9, 0.5), 0.3 * (hand.dof + 2)  # height of the ranges [inches], 0.3 for each joint
     views = [

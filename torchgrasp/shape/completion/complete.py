@@ -16,6 +16,7 @@ from torchgrasp.cloud.neighbours import nearest
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions, unit
+from torchgrasp.lazy import spatial
 from torchgrasp.shape.completion.axis import Revolution, find_axis, find_revolution
 from torchgrasp.shape.completion.ellipsoid import find_ellipsoid
 from torchgrasp.shape.completion.silhouette import FRONT_MARGIN, TIE, Outlines
@@ -248,12 +249,10 @@ def merge_hidden(
 
     `thin` selects the points of a part to keep: it returns their indices.
     """
-    from scipy.spatial import KDTree
-
     for part in parts:
         new = part[allowed(part)]
         if len(merged) and len(new):
-            distance, _ = KDTree(merged.points.numpy()).query(new.points.numpy())
+            distance, _ = spatial.KDTree(merged.points.numpy()).query(new.points.numpy())
             new = new[torch.from_numpy(distance) > SPACING]
         merged = join([merged, new[thin(new.points)]])
     return merged

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.geometry.linalg import Points, farthest_points, fibonacci_sphere, unit
+from torchgrasp.lazy import optimize
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 
 INDEPENDENT, INDEPENDENT_RIM = 60, 8  # points of the cloud and the outline that count as independent
@@ -73,8 +74,6 @@ class _Fit:
 
     def solve(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the 9 fitted parameters and their covariance matrix."""
-        from scipy.optimize import least_squares
-
         rows = np.concatenate([2 * self.points, np.ones_like(self.points[:, :1])], 1)
         ball = np.linalg.lstsq(rows, (self.points**2).sum(1), rcond=None)[0]
         longest = np.ptp(self.points, axis=0).max()
@@ -82,7 +81,7 @@ class _Fit:
         start = np.concatenate([ball[:3], radius * np.eye(3)[UPPER]])
         jacobian: Any = self.jacobian  # of which SciPy's annotations do not know
         options: Any = {"x_scale": "jac", "loss": "soft_l1", "max_nfev": 40}
-        found = least_squares(lambda x: self.residuals(x[None])[0], start, jacobian, **options)
+        found = optimize.least_squares(lambda x: self.residuals(x[None])[0], start, jacobian, **options)
         return found.x, np.linalg.inv(found.jac.T @ found.jac)
 
     def jacobian(self, parameters: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from torchgrasp.checks import Pose, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, farthest_points, unit
+from torchgrasp.lazy import ndimage, spatial
 from torchgrasp.values import PointCloud
 
 GROW, SHRINK = 2.0, 1.65  # the outline is a union of discs about the pixels, then shrunk [pixel spacings]
@@ -130,12 +131,9 @@ def silhouette(view: PointCloud) -> Silhouette:
     A gap within the outline is a hole if it is far wider than the surface around it, as in a frame of bars. Other gaps
     do not count as free space, because a mirror-like patch is not measured either.
     """
-    from scipy.ndimage import binary_fill_holes, distance_transform_edt
-    from scipy.spatial import KDTree
-
     assert view.viewpoint is not None
     axes, pixels, depths = (t.numpy() for t in _project(view.points, view.viewpoint))
-    distance, _ = KDTree(pixels).query(pixels, k=min(5, len(pixels)))
+    distance, _ = spatial.KDTree(pixels).query(pixels, k=min(5, len(pixels)))
     spacing = float(np.median(distance[:, -1]))
     low, high = pixels.min(0), pixels.max(0)
     extent = float((high - low).max())
@@ -147,9 +145,9 @@ def silhouette(view: PointCloud) -> Silhouette:
     order = np.argsort(-depths)  # of pixels that share a cell the nearest to the camera is written last
     raster = np.zeros(shape)
     raster[row[order], column[order]] = depths[order]
-    nearest = np.asarray(distance_transform_edt(raster == 0, return_distances=False, return_indices=True))
+    nearest = np.asarray(ndimage.distance_transform_edt(raster == 0, return_distances=False, return_indices=True))
     measured = _distance(raster == 0) * cell <= GROW * spacing
-    grown = np.asarray(binary_fill_holes(measured))
+    grown = np.asarray(ndimage.binary_fill_holes(measured))
     gaps = grown & ~measured
     gap = 2 * (float(_distance(gaps).max()) * cell + GROW * spacing) * bool(gaps.any())
     grown &= ~_find_holes(gaps, measured, GROW * spacing / cell)
@@ -172,11 +170,9 @@ def _find_holes(gaps: np.ndarray, measured: np.ndarray, grown: float) -> np.ndar
 
     The surface is the mask `measured`, which was grown by so many cells.
     """
-    from scipy.ndimage import label, maximum
-
-    number, count = label(gaps)  # pyright: ignore[reportGeneralTypeIssues]
+    number, count = ndimage.label(gaps)  # pyright: ignore[reportGeneralTypeIssues]
     wide, holes = _distance(measured), np.zeros_like(gaps)
-    for k, radius in enumerate(maximum(_distance(gaps), number, range(1, count + 1)) + grown, start=1):
+    for k, radius in enumerate(ndimage.maximum(_distance(gaps), number, range(1, count + 1)) + grown, start=1):
         if radius > 2 * grown:  # a narrower gap lies between sparse points
             around = measured & (_distance(number != k) < 2 * radius)
             holes |= (number == k) & (2 * (wide[around].max() - grown) < radius)
@@ -201,15 +197,13 @@ def _beyond_image(
 
 def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> None:
     """Raise `BadArgument` for points that no camera at the viewpoint can see at once."""
-    from scipy.spatial import KDTree
-
     forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
     behind = int(((points - viewpoint) @ forward <= 0).sum())
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
         raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
     _, pixels, depth = _project(points, viewpoint)
-    apart, index = KDTree(pixels.numpy()).query(pixels.numpy(), k=min(6, len(pixels)))
+    apart, index = spatial.KDTree(pixels.numpy()).query(pixels.numpy(), k=min(6, len(pixels)))
     deeper = depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
     points = points.double().cpu()
     radius = torch.linalg.vector_norm(points - (points.amax(0) + points.amin(0)) / 2, dim=-1).max()
@@ -232,20 +226,15 @@ def _project(
 
 def _distance(mask: np.ndarray) -> np.ndarray:
     """Return the distance [cells] of each cell to the nearest cell outside the mask."""
-    from scipy.ndimage import distance_transform_edt
-
-    return np.asarray(distance_transform_edt(mask))
+    return np.asarray(ndimage.distance_transform_edt(mask))
 
 
 def _rim(
     outside: np.ndarray, seen: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their surface normals."""
-    from scipy.ndimage import gaussian_filter
-    from scipy.spatial import KDTree
-
     row, column = np.nonzero(seen & (np.abs(outside) <= 0.75 * cell))
-    smooth = gaussian_filter(outside, 3.0)
+    smooth = ndimage.gaussian_filter(outside, 3.0)
     slope = np.stack([np.gradient(smooth, axis=axis)[row, column] for axis in (1, 0)], -1)
     slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
     position = corner + cell * np.stack([column, row], -1)
@@ -253,7 +242,7 @@ def _rim(
         return np.zeros((0, 3)), np.zeros((0, 3))
     picks = farthest_points(torch.from_numpy(position), 16, tie=TIE).numpy()
     position, slope = position[picks], slope[picks]
-    _, index = KDTree(pixels).query(position, k=min(4, len(pixels)))
+    _, index = spatial.KDTree(pixels).query(position, k=min(4, len(pixels)))
     depth = np.median(depths[index].reshape(len(position), -1), axis=-1)
     ray = np.concatenate([position, np.ones((len(position), 1))], -1)
     # The cone's normal is perpendicular to the ray and to the outline's tangent, and leans with the slope.

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, reflect, reflect_directions, unit
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.lazy import spatial
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
 
@@ -78,9 +79,7 @@ class SymmetryScorer:
     @functools.cached_property
     def tree(self) -> "KDTree":
         """The k-d tree over all points of the cloud, for finding nearest neighbours."""
-        from scipy.spatial import KDTree
-
-        return KDTree(self.points.numpy(), leafsize=32)
+        return spatial.KDTree(self.points.numpy(), leafsize=32)
 
     @property
     def center(self) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchgrasp.base import Batch, Value
 from torchgrasp.geometry.linalg import Points, farthest_points, solve_least_squares, unit
+from torchgrasp.lazy import spatial
 from torchgrasp.shape.completion.axis import fit_axis, rotations_about_z
 from torchgrasp.shape.completion.complete import NEW, merge_hidden
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
@@ -168,9 +169,7 @@ def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float
 
 def _merge(seen: Points, outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float) -> HiddenWall:
     """Return the hidden points of the parts, between rim and `least` height, apart from seen and earlier points."""
-    from scipy.spatial import KDTree
-
-    tree = KDTree(seen.numpy())
+    tree = spatial.KDTree(seen.numpy())
 
     def allowed(part: HiddenWall) -> Bool[Tensor, "n"]:
         within = (part.points[:, 2] < vessel.rim - RIM) & (part.points[:, 2] >= least)

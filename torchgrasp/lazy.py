@@ -1,0 +1,32 @@
+"""Modules that take long to import, or that few users need: each is imported when one of its names is first used."""
+
+import importlib
+import types
+from typing import TYPE_CHECKING, Any
+
+
+class _Late(types.ModuleType):
+    """A stand-in for a module."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Import the module, and return what it calls `name`, or the module of that name in it."""
+        module = importlib.import_module(self.__name__)
+        return getattr(module, name) if hasattr(module, name) else importlib.import_module(f"{self.__name__}.{name}")
+
+
+if TYPE_CHECKING:
+    import matplotlib as matplotlib
+    import trimesh as trimesh
+    from PIL import Image as Image
+    from PIL import ImageDraw as ImageDraw
+    from PIL import ImageFont as ImageFont
+    from scipy import ndimage as ndimage
+    from scipy import optimize as optimize
+    from scipy import sparse as sparse
+    from scipy import spatial as spatial
+else:
+    matplotlib, trimesh = _Late("matplotlib"), _Late("trimesh")
+    Image, ImageDraw, ImageFont = (_Late(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont"))
+    ndimage, optimize, sparse, spatial = map(
+        _Late, ("scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.spatial")
+    )
