@@ -10,6 +10,8 @@ class _Late(types.ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         """Import the module, and return what it calls `name`, or the module of that name in it."""
+        if name.startswith("__"):
+            raise AttributeError(name)
         module = importlib.import_module(self.__name__)
         return getattr(module, name) if hasattr(module, name) else importlib.import_module(f"{self.__name__}.{name}")
 
