@@ -74,8 +74,7 @@ class Value:
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
         """Return the value on another device or in another floating dtype; integer tensors keep their dtype.
 
-        Raises:
-            BadArgument: the device does not exist, or the dtype is neither float32 nor float64.
+        Raises `BadArgument` if the device does not exist, or the dtype is neither float32 nor float64.
         """
         check_moved(*args, **kwargs)
 

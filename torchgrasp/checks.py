@@ -72,10 +72,8 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
     in a shape has the same size as in the fields of the object. A value without `__post_init__` that the library makes
     from tensors is not checked. With `gradients` True, the function is differentiable: it takes tensors that require a
     gradient, dual tensors and tensors inside a transform of torch.func. All other functions refuse these tensors.
-    Numbers inside torch.vmap and arguments inside torch.compile are not checked.
-
-    Raises:
-        BadArgument: in a call, an argument has a wrong type, shape, dtype or range, or a number that is not finite.
+    Numbers inside torch.vmap and arguments inside torch.compile are not checked. A call raises `BadArgument` if an
+    argument has a wrong type, shape, dtype or range, or a number that is not finite.
     """
     if thing is None:
         return functools.partial(checked, gradients=gradients)

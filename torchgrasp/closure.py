@@ -214,8 +214,7 @@ class SensorModel(Value):
         noise: factor that multiplies the usual noise of the sensor.
         dead: names of the fingers whose sensor is known to be broken.
 
-    Raises:
-        BadArgument: a number outside its range, an unknown kind.
+    Raises `BadArgument` for a number outside its range, or an unknown kind.
 
     >>> SensorModel("binary").full
     False

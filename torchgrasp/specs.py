@@ -44,8 +44,7 @@ class ContactSpec(Value):
         contact_allowed: whether links may touch and push the target's neighbours; collisions then only lower the
             predicted success.
 
-    Raises:
-        BadArgument: a number outside its range.
+    Raises `BadArgument` for a number outside its range.
 
     >>> ContactSpec(friction=0.8).planned_friction
     0.4

@@ -273,8 +273,7 @@ def format_success(success: "Grasps | float") -> str:
 def load_grasps(path: Path | str) -> Grasps:
     """Read grasps that `Grasps.save` wrote.
 
-    Raises:
-        ModelFileError: the file is missing, or a pose, a status or the number of contacts is not valid.
+    Raises `ModelFileError` if the file is missing, or a pose, a status or the number of contacts is not valid.
 
     >>> import tempfile
     >>> from torchgrasp.data.shipped import load_shipped_grasp

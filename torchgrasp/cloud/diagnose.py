@@ -60,8 +60,7 @@ def diagnose_cloud(
         table: plane of the table; None if the table is assumed at the lowest point.
         stands: whether the object stands on a table; else the camera may be below it.
 
-    Raises:
-        BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`; a vertical of length zero.
+    Raises the errors of `check_cloud`, and `BadArgument` for a vertical of length zero.
 
     >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
     0

@@ -63,8 +63,7 @@ def cut_object(
         box: two opposite corners [m] of a box along the axes; points outside are left out first.
         gap: least distance [m] between objects.
 
-    Raises:
-        TooFewPoints: fewer than 4 points in the box, near the point or of the object.
+    Raises `TooFewPoints` for fewer than 4 points in the box, near the point or of the object.
 
     >>> from torchgrasp import load_scene
     >>> seen = PointCloud(load_scene().points.double())

@@ -91,10 +91,7 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicate points, with outward unit normals of quadrics fitted around the points.
 
     Outward is towards the viewpoint. If the viewpoint is unknown, outward is the side of the given normals. If normals
-    are missing, too, the viewpoint is estimated.
-
-    Raises:
-        BadArgument, TooFewPoints, SuspiciousScale: see `check_cloud`.
+    are missing, too, the viewpoint is estimated. Raises the errors of `check_cloud`.
 
     >>> estimate_normals(PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))).normals.shape
     torch.Size([90, 3])

@@ -86,8 +86,7 @@ def read_cloud_file(
 ) -> CloudFile:
     """Read a cloud of any size, such as a whole scene, with notes on what was left out; see `read_cloud`.
 
-    Raises:
-        CloudFileError, BadArgument, TooFewPoints: see `read_cloud`.
+    Raises `CloudFileError`, `BadArgument` and `TooFewPoints` as `read_cloud`.
 
     >>> read_cloud_file("none.ply")
     Traceback (most recent call last):
@@ -128,8 +127,7 @@ def cloud_from_array(
         normals: outward normals, of the same shape as points, or None.
         viewpoint: the camera's position (3,), or None.
 
-    Raises:
-        BadArgument, TooFewPoints, SuspiciousScale: see `read_cloud`.
+    Raises the errors of `check_cloud`.
 
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
     48

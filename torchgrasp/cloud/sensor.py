@@ -166,8 +166,7 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
     Args:
         frames: images (h, w) of one size and one dtype.
 
-    Raises:
-        BadArgument: no frame; frames of several sizes or dtypes; a frame in which camera or scene have moved.
+    Raises `BadArgument` for no frame, for frames of several sizes or dtypes, or if camera or scene have moved in one.
 
     >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
     tensor([[0.0000, 0.7010]])

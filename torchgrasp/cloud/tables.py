@@ -48,8 +48,7 @@ def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str
 def read_table(data: bytes, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
     """Return the first `rows` rows of a table separated by white space. Little memory beyond the numbers is used.
 
-    Raises:
-        ValueError: `rows` or `columns` is above its limit, the data has fewer numbers, or a word is not a number.
+    Raises `ValueError` if `rows` or `columns` is above its limit, or the data has fewer numbers or a word that is none.
     """
     if not (0 <= rows <= CLOUD_POINTS and 1 <= columns <= TEXT_COLUMNS):
         raise ValueError(f"{rows} points of {columns} numbers, not up to {CLOUD_POINTS} of {TEXT_COLUMNS}")

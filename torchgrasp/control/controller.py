@@ -144,8 +144,7 @@ class GraspController:
         Args:
             cloud: points [m] of the object alone, in the frame of the grasp.
 
-        Raises:
-            BadArgument: the hand has no approach, or has begun it.
+        Raises `BadArgument` if the hand has no approach, or has begun it.
         """
         reference = self.planned
         if self.guard is None or self.guard.left < self.guard.length:
@@ -164,9 +163,8 @@ class GraspController:
         """Return the targets of joints and palm for the next tick, which comes `period` [s] later.
 
         In the tick in which the closing ends, the targets do not change: that tick computes the forces of holding.
-
-        Raises:
-            BadArgument: an observation of another hand, or on a device other than the CPU; a period out of range.
+        Raises `BadArgument` for an observation of another hand or on a device other than the CPU, or a period out of
+        range.
         """
         shape = len(self.reference.normals), 3, len(self.targets.joints)
         found = tuple(observation.jacobian.shape)

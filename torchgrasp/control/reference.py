@@ -143,8 +143,7 @@ class ClosingReference(Value):
     def as_printed(self) -> "ClosingReference":
         """Return the plan with Sigma_cov and K_P of Eqs. (26) and (27) as the paper prints them, for closing "paper".
 
-        Raises:
-            BadArgument: the plan lacks `distance_variance`.
+        Raises `BadArgument` if the plan lacks `distance_variance`.
         """
         if self.distance_variance is None:
             found = "'paper' without f_cov, the variance of the signed distance [m^2]"

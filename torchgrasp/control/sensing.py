@@ -62,8 +62,7 @@ def feel_torques(
         torques: torques of all joints [N m] that contacts cause, without those of weight, friction and acceleration.
         period: time since the last readings [s].
 
-    Raises:
-        BadArgument: a Jacobian with the shape of another hand.
+    Raises `BadArgument` for a Jacobian with the shape of another hand.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -100,8 +100,7 @@ def measure(
         generator: draws the noise; without one there is no noise.
         noise: factor on the standard deviation of the noise.
 
-    Raises:
-        BadArgument: true contacts on another device than the state.
+    Raises `BadArgument` for true contacts on another device than the state.
 
     >>> normals, pressed = torch.eye(3).double(), torch.tensor([2.0, 0.0, 1.0]).double()  # [N]
     >>> truth = TipContact(pressed, -pressed[:, None] * normals, 0.03 * normals, normals)
@@ -185,8 +184,7 @@ class Observation(Value):
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
     """Return the observation of a robot, from its measured actuated joints [rad] and fingertip readings.
 
-    Raises:
-        BadArgument: joints or fingertips on another device than the hand.
+    Raises `BadArgument` for joints or fingertips on another device than the hand.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")

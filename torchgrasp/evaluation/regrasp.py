@@ -90,8 +90,7 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
         spec: parameters of the trial; `TrialSpec()` by default.
         tries: largest number of grasps to try; with one the trial is that of `close_hand`.
 
-    Raises:
-        BadArgument, MeshError, MissingExtra: as `close_hand`.
+    Raises the errors of `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

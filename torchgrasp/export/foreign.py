@@ -182,8 +182,7 @@ def grasps_from_joints(
         spec: friction and number of cone edges of the certificate; `ContactSpec()` by default.
         std_m: standard deviation [m] of the surface at each contact, for closing controllers that use it.
 
-    Raises:
-        BadArgument: wrong shapes, joints outside the limits, poses that are not rigid.
+    Raises `BadArgument` for wrong shapes, joints outside the limits, or poses that are not rigid.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")

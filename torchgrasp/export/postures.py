@@ -42,10 +42,7 @@ def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     The hand moves along "approach" to "pose" and its "rise", in its "pregrasp" posture. It closes to "grasp" in the
     given time, and in the same time again it presses towards "squeeze". All joints move evenly. The strongest finger
     presses with a normal force of `force` [N]. `kp` is the stiffness of the robot's position control [N m/rad], by
-    default the hand's.
-
-    Raises:
-        BadArgument: joints of another hand, or a force or stiffness that is not positive.
+    default the hand's. Raises `BadArgument` for joints of another hand, or a force or stiffness that is not positive.
 
     >>> import json
     >>> from torchgrasp import load_hand
@@ -123,10 +120,8 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positiv
     The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl` is the targets of
     the actuators. The text elements "qpos" and "ctrl" name their order. The approach has the joints of the pre-grasp.
     The squeeze has the joints of the grasp and targets that press. `force` [N] is the normal force of the strongest
-    finger. `kp` is the stiffness of every drive [N m/rad], by default the hand's own.
-
-    Raises:
-        BadArgument: joints of another hand, or a force or stiffness that is not positive.
+    finger. `kp` is the stiffness of every drive [N m/rad], by default the hand's own. Raises `BadArgument` for joints
+    of another hand, or a force or stiffness that is not positive.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -39,8 +39,7 @@ class Plane(Value):
         normal: unit vector that points up.
         offset: distance [m] of the plane from the origin along the normal.
 
-    Raises:
-        BadArgument: the normal is not of unit length, or a number is not finite.
+    Raises `BadArgument` if the normal is not of unit length, or a number is not finite.
 
     >>> plane = Plane.horizontal(0.1)
     >>> plane.describe(), plane.height(torch.tensor([0.0, 0.0, 0.3]))

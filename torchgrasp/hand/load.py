@@ -30,8 +30,7 @@ def hands_folder() -> Path:
 def find_hand(name_or_path: str | Path) -> Path:
     """Return the folder of a hand, given a shipped hand's name, a folder or a hand.toml.
 
-    Raises:
-        HandFileError: no such hand, or a shipped name that is also a folder in the working directory.
+    Raises `HandFileError` for no such hand, or a shipped name that is also a folder in the working directory.
 
     >>> find_hand("allegro").name
     'allegro'

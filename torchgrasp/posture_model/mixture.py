@@ -45,10 +45,8 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     """Return the codes of contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
 
     A code is three lengths [m] and three cosines, which no rigid motion changes. Points [m] and unit normals have shape
-    (b, 3, 3). Contacts on a line give NaN and `Status.DEGENERATE`. Codes and frames are differentiable in both.
-
-    Raises:
-        BadArgument: wrong shapes, non-finite numbers, or normals whose length is not 1 within 1e-3.
+    (b, 3, 3). Contacts on a line give NaN and `Status.DEGENERATE`. Codes and frames are differentiable in both. Raises
+    `BadArgument` for wrong shapes, numbers that are not finite, or normals whose length is not 1 within 1e-3.
 
     >>> encode((torch.eye(3)[None], torch.eye(3)[None])).q.shape
     torch.Size([1, 6, 6])

@@ -173,11 +173,8 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     """Return the probability that each voxel around the target is full of something other than target and table.
 
     The scene must be in its upright frame, with z up. Space in front of a measured depth is free. Behind an object, a
-    model estimates the probability. Behind the target and outside the image, it is a rough guess from depth
-    and height. All work is on the CPU.
-
-    Raises:
-        BadArgument: a target without points.
+    model estimates the probability. Behind the target and outside the image, it is a rough guess from depth and height.
+    All work is on the CPU. Raises `BadArgument` for a target without points.
 
     >>> from torchgrasp import load_scene
     >>> found = estimate_occupancy(load_scene(), target=1)

@@ -184,8 +184,7 @@ class Scene(Value):
         Args:
             target: a label, a pixel (u, v) of the image, or a point (x, y, z) [m].
 
-        Raises:
-            BadArgument: no such label; nothing measured at the pixel or point; a place on the table.
+        Raises `BadArgument` for no such label, for a place where nothing was measured, or for a place on the table.
         """
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:

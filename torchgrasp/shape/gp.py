@@ -103,10 +103,8 @@ class ShapeGP(Posterior, Normalisation):
         differentiable in the points to any order. Inside torch.vmap the domain is not checked.
 
         Outside the domain, within its diameter of the centre, the distance grows outward from that at the nearest point
-        of the domain, with slope 1. Covariance and `std_m` are there the prior's.
-
-        Raises:
-            BadArgument: non-finite numbers, or a point farther outside, where a thin plate's variance is negative.
+        of the domain, with slope 1. Covariance and `std_m` are there the prior's. Raises `BadArgument` for numbers that
+        are not finite, or a point farther outside, where a thin plate's variance is negative.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> shape = fit_shape(load_object("jug").view)
@@ -124,8 +122,8 @@ class ShapeGP(Posterior, Normalisation):
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
         """Return the derivatives of the results of `predict` by the query points, per metre.
 
-        Raises:
-            BadArgument: non-finite numbers, or a point outside the domain: at its edge the deviation jumps.
+        Raises `BadArgument` for numbers that are not finite, or a point outside the domain: at its edge the deviation
+        jumps.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> view = load_object("jug").view
@@ -193,8 +191,7 @@ class ShapeGP(Posterior, Normalisation):
             noise: standard deviation of a point [m] along the normal.
             normal_noise: standard deviation of the components of a unit normal.
 
-        Raises:
-            BadArgument: a wrong argument, or a point outside the domain.
+        Raises `BadArgument` for a wrong argument, or a point outside the domain.
 
         >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
         >>> from torchgrasp import fit_shape

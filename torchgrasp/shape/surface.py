@@ -56,11 +56,9 @@ class Surface(Value):
 def extract_surface(shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = RESOLUTION) -> Surface:
     """Return the surface, where the mean distance is zero (Eq. 9 of the paper), by marching cubes and Newton steps.
 
-    `resolution` is the number of cells along the domain's diameter. Separate pieces are left out if they
-    are nearest to less than 2 % of the cloud.
-
-    Raises:
-        BadArgument: a resolution outside [8, 256], or a mean distance that is nowhere zero.
+    `resolution` is the number of cells along the domain's diameter. Separate pieces are left out if they are nearest to
+    less than 2 % of the cloud. Raises `BadArgument` for a resolution outside [8, 256], or a mean distance that is
+    nowhere zero.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> surface = extract_surface(fit_shape(load_object("jug").view, table=0.0), resolution=24)

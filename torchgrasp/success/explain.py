@@ -47,8 +47,7 @@ def explain_success(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask 
         shape: the estimated shape, in the frame of the grasps.
         task: the task of the grasps; by default `GraspTask()`.
 
-    Raises:
-        BadArgument: no grasps, or grasps of another planner.
+    Raises `BadArgument` for no grasps, or grasps of another planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

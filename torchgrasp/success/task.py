@@ -23,8 +23,7 @@ class GraspTask(Value):
         closing: how the hand closes, see `TrialSpec`.
         displaced: whether the object may be elsewhere: up to 30 mm along the table, or 5 mm and 5 degrees if it floats.
 
-    Raises:
-        BadArgument: a number outside its range; a lift in open loop.
+    Raises `BadArgument` for a number outside its range, or a lift in open loop.
 
     >>> GraspTask(mass=0.5, lift=True).describe(), GraspTask(force=7.0, lift=False).describe()
     ('lift of 0.5 kg', 'pulls of 0.25 kg with 7 N')

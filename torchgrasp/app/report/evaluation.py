@@ -31,11 +31,7 @@ def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], 
         asked: settings of the evaluation by name.
         scores: results of `evaluate`.
 
-    Returns:
-        The path of the file.
-
-    Raises:
-        OutputError: the file cannot be written.
+    Returns the path. Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> jug = ViewScore("jug", "view0", 0, 4.0, note="an open surface")

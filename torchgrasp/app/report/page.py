@@ -34,11 +34,7 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
         run: the run to show.
         view: file name of the 3D page that `write_viewer` wrote beside the report, for a link.
 
-    Returns:
-        The path of the file.
-
-    Raises:
-        OutputError: the file cannot be written.
+    Returns the path. Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object

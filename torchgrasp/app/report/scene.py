@@ -30,8 +30,7 @@ KINDS = {
 def draw_scene(scene: Scene, path: Path | str) -> Path:
     """Write a picture of a scene as PNG: the support, numbered objects, obstacles, unmeasured pixels and a legend.
 
-    Raises:
-        OutputError: the file cannot be written.
+    Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene

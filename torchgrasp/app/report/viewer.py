@@ -40,14 +40,9 @@ def write_viewer(path: Path | str, run: Run) -> Path:
     """Write a run as a 3D page in one HTML file, atomically. The page needs WebGL, but no network.
 
     The page shows the cloud, the surface by its standard deviation, a shell at k standard deviations, contacts, four
-    postures of the hand for each of the best 20 grasps, and the closing with its forces. The address may name a
-    state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`.
-
-    Returns:
-        The path of the file.
-
-    Raises:
-        OutputError: the file cannot be written.
+    postures of the hand for each of the best 20 grasps, and the closing with its forces. The address may name a state,
+    as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`. Returns the path. Raises `OutputError` if
+    the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
