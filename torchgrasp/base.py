@@ -14,7 +14,6 @@ from torchgrasp.checks import Range, check_moved, read_number, show
 from torchgrasp.errors import BadArgument, FailedRows, Status
 
 FINGERTIPS = (3, 5)  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
-
 Kept = TypeVar("Kept")
 SomeValue = TypeVar("SomeValue", bound="Value")
 SomeBatch = TypeVar("SomeBatch", bound="Batch")

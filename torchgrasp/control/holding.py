@@ -15,7 +15,6 @@ from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.plan.forces import least_friction_forces
 
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
-
 RAMP = 0.4  # time [s] in which the forces rise to the desired forces
 MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations of its reading
 PRIOR_STD, MIN_STD = 0.2, 0.03  # standard deviation of the friction estimate at the start, and its least value

@@ -17,13 +17,9 @@ POSITION_FLOOR = 0.005
 """Standard deviation [m], in all directions, of errors of hand pose and joint zeros; it keeps Eq. (27) finite."""
 
 POSITION_RATE = 4.0  # largest position gain [1/s]: alpha_p = POSITION_RATE * POSITION_FLOOR**2
-
 FORCE_BANDWIDTH = 15.0  # bandwidth [rad/s] of the most certain force loop; the lag of the sensor's filter bounds it
-
 FORCE_FLOOR = 0.3  # isotropic standard deviation [N] of Sigma_fd: the tactile sensor's noise along the surface
-
 MAX_SPEED = 0.04  # largest speed [m/s] of a fingertip
-
 MAX_STEP = 0.05  # largest change [rad] of a joint in one tick; it bounds steps near a singular posture
 
 

@@ -22,9 +22,7 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
 
 SPEED, ACCELERATION = 0.1, 1.0  # largest speed [m/s] of the approach, and its acceleration [m/s^2]
-
 PRESSING_TIME = 0.5  # time [s] from the end of closing until the hand counts as closed, and is judged
-
 MISPLACED = 0.008
 """Distance [m] between the displacements of object and palm from which the hand opens: twice the estimate's error."""
 

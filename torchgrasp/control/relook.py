@@ -12,7 +12,6 @@ from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values import PointCloud
 
 REACH = 0.08  # largest displacement [m] on each axis of the table that `relocate` tries at first
-
 SCALE = 0.004  # distance [m] from the surface beyond which a point of a new view counts less
 
 

@@ -14,11 +14,8 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 
 SAMPLING_RATE = 100.0  # samples of a fingertip a second [Hz]
-
 NOISE = 0.1  # standard deviation [N] of the normal force (Sec. 6.5).
-
 FLAG_CUTOFF = 5.0  # cut-off [Hz] of the average force behind the contact flag
-
 TOUCH_ON = 0.2  # average force [N] at which the contact flag turns on; it turns off at half of this force
 STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays on its path
 

@@ -17,13 +17,9 @@ from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.geometry.linalg import limit_norm
 
 PATIENCE = 2.5  # longest time [s] from the first touch until the closing ends, even if some finger has not touched
-
 QUICK_TOUCH = 0.45  # reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on
-
 PALM_SPEED = 0.04  # largest speed [m/s] of the palm that follows the object
-
 STALLED = 0.25  # force [N] of its drives at which a finger without a sensor counts as touching
-
 LEAD = 0.04
 """Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link that is blocked."""
 

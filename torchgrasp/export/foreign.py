@@ -34,7 +34,6 @@ from torchgrasp.values import Contacts, Grasps
 MOST_GRASPS = 100_000  # most grasps of a file: more are no plan of one object
 FAR = 10_000.0  # largest number of a pose or posture [mm, rad] in a JSON file
 _refuse = functools.partial(ModelFileError, "path")  # the error of a bad file of grasps
-
 Quaternion = Literal["wxyz", "xyzw"]
 
 

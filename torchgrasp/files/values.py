@@ -28,7 +28,6 @@ Item = TypeVar("Item")
 SomeValue = TypeVar("SomeValue", bound=Value)
 
 VERSION = "1"  # version of the file layout; readers refuse all others
-
 DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)  # dtypes in our files
 
 

@@ -17,7 +17,6 @@ from filelock import FileLock, Timeout
 from torchgrasp.errors import BadArgument, OutputError, Status
 
 Refuse = Callable[[str, str], BadArgument]  # makes an error of what was found and what is allowed
-
 ENDING = ".part"  # ending of the name under which a file is written; a dot and the name of the file come first
 LOCK = ".lock"  # name of the lock file in a folder. It holds the process and host of the run.
 

@@ -17,7 +17,6 @@ from torchgrasp.lazy import trimesh
 from torchgrasp.limits import MAX_EXTENT, MESH_BYTES, MESH_FACES, MIN_EXTENT, PLY_HEADER_BYTES, PLY_PROPERTIES
 
 SUFFIXES = (".obj", ".off", ".ply", ".stl")  # formats whose memory is bounded by the size of the file
-
 _REFERENCE = re.compile(rb"/\S*")  # normal and texture of a corner in an .obj: two textures would open the surface
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12  # least volume [m^3] of a body

@@ -21,7 +21,6 @@ else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 SUPPORTED = "three to five different fingers"  # fingers of a grasp, see `FINGERTIPS`
-
 _DOTTED = re.compile(
     r"""(?<![\w"'-])(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}"""
 )
@@ -47,7 +46,6 @@ class Finger(NamedTuple):
 
 
 Grasping = tuple[Finger, ...]  # the grasping fingers, three to five, in grasp order
-
 Fingers = str | int | tuple[str, ...]
 """The grasping fingers: an option of hand.toml, a number of fingers, or names, also as "index,middle,thumb"."""
 

@@ -75,7 +75,6 @@ def _close_triples(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3
 CHUNK_POSTURES = 10_000  # free postures from one generator; another number gives a seed other postures
 BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for the same reason
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
-
 Sampling = Literal["uniform", "grasping"]
 """Which of the random postures without self-collision are taken.
 

@@ -19,7 +19,6 @@ Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise, smooth where r > 0 and four times so at 0 from the right, with k'(0) = 0."""
 KernelName = Literal["thin_plate", "matern52", "rbf"]
 Orders = Annotated[int, Range(1, 4)]  # how many of k and its derivatives
-
 NEAR_ZERO = 1e-4  # below it k(r) is taken as its Taylor polynomial of degree 4, as k'(r) / r is 0 / 0 at r = 0
 
 

@@ -25,7 +25,6 @@ TILT = math.radians(30)
 """Angle [rad] by which the contact of a round tip is turned from the direction of motion to the finger's end."""
 SHORT_ARM = 1e-3  # a joint whose axis passes a tip nearer than this [m] does not move it
 BESIDE = 0.003  # distance [m] from a ray or a plane within which points of a surface count
-
 Vector = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 

@@ -15,7 +15,6 @@ from torchgrasp.hand.urdf import SIZES, Joint, Link, Mimic, Shape, Triple, Urdf
 from torchgrasp.lazy import trimesh
 
 EFFORT, VELOCITY = 1.0, 3.0  # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
-
 Step = tuple[Urdf, list[str]]
 
 

@@ -19,9 +19,7 @@ from torchgrasp.plan.forces import grasp_map, internal_forces
 Rows = Float[Tensor, "*b 3 3"]
 
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
-
 POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
-
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
 TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0  # stiffness of the virtual frame [N/m, N m/rad]
 GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the triangle of fingertips

@@ -27,11 +27,8 @@ STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "lo
 """Logarithms of spring stiffness [N/m], of the tips' distances from their virtual frame [m], of normal forces [N]."""
 
 NAMES = (*STIFFNESS, *LENGTHS, *FORCES)  # components of the state of a grasp
-
 LEAST_FORCE = 0.05  # least normal force [N] of a finger in a state
-
 FILE = "stability.safetensors"  # name of the model in the hand's folder
-
 PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "means", "covariances")]
 """Tensors of a model file."""
 

@@ -38,7 +38,6 @@ PART = 0.02  # length scale [m] of the asymmetry: a part without a mirror image 
 THIN = 0.012  # width [m] below which a part is a bar: that of a fingertip
 TEMPERATURE = 0.1  # a plane's probability is proportional to exp(score / temperature)
 NEARBY, NEARBY_ANGLE, NEARBY_SHIFT = 5, 0.15, 0.045  # planes near a plane: steps of an axis, angle [rad], shift / size
-
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
 """What the hidden side was estimated from: an ellipsoid, an axis, mirror planes, or only the outline (a guess)."""
 SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
