@@ -12,7 +12,7 @@ from torchgrasp import Contacts, ShapeGP
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure import closed_exact, tangents
 from torchgrasp.plan.closure_probability import FOOTPRINT
-from torchgrasp.shape.posterior import distance_covariance
+from torchgrasp.shape.posterior import combined_covariance
 
 GRID_POINTS = 37
 """Points of a line, over 12 standard deviations to either side: the deviations grow away from what was seen."""
@@ -37,7 +37,7 @@ def _closed_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, s
     across = torch.cat([torch.zeros_like(axes[:, :1]), axes, -axes], 1) * width
     asked = (places[:, :, None] + across[:, None]).reshape(-1, 3)
 
-    values = distance_covariance(shape, asked[None])[0] * shape.std_factor**2
+    values = combined_covariance(shape, asked[None, :, None], asked.new_ones(1, 1, 1, 1))[0] * shape.std_factor**2
     eigenvalues, vectors = torch.linalg.eigh(values)
     root = (vectors * eigenvalues.clamp(min=0.0).sqrt()) @ vectors.T
     generator = torch.Generator().manual_seed(seed)

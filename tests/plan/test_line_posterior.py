@@ -9,7 +9,7 @@ from tests.make import HALF_BALL_RADIUS as RADIUS
 from tests.make import contacts_on, near
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.plan.closure_probability import FOOTPRINT, NODES, first_contact, grid, line_posterior
-from torchgrasp.shape.posterior import combined_covariance, distance_covariance
+from torchgrasp.shape.posterior import combined_covariance
 
 
 def test_a_finger_stops_where_the_drawn_distance_turns_negative_nearest_to_its_contact(doubtful, generator):
@@ -55,6 +55,11 @@ def test_the_posterior_on_the_lines_is_that_of_distance_and_normal(doubtful, gen
             torch.testing.assert_close(deviation[b, i, k, 0, i, k, 0], variance, rtol=1e-6, atol=1e-12)
             held += 1
     assert 20 < held < 45  # outside the domain deviations are those at its edge
+
+
+def distance_covariance(posterior, x):
+    """The covariance of the distances in each set of points (b, k, 3)."""
+    return combined_covariance(posterior, x[:, :, None], x.new_ones(1, 1, 1, 1))
 
 
 def test_covariances_of_distances_and_their_sums_are_those_of_the_joint_posterior(doubtful, generator):

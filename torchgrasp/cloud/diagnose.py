@@ -155,17 +155,14 @@ def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
     flipped = 0.0 if check is None else float(check.flipped.double().mean())
     cut, thin = "torchgrasp cloud cut CLOUD --out FILE", f"torchgrasp cloud thin CLOUD --voxel {voxel:.2g} --out FILE"
     many = f"{report.points} points, of which {MAX_POINTS} are used"
+    few = f"fewer than {FEW_POINTS} points, too few for a shape"
     sparse = f"{1e3 * report.spacing:.0f} mm between points, so that the shape is mostly guessed"
     guess = f"a camera whose position is a guess, {f'to {angle:.0f} degrees' if angle < 180 else 'on weak evidence'}"
     rules = [
         (longest > 0.4, f"a length of {longest:.2f} m, large for a hand, as of a whole scene", f"one object: {cut}"),
         (report.points > 2 * MAX_POINTS, many, f"as many: {thin}"),
         (outliers > 0.05, f"{outliers:.0%} of the points far from the others", f"none: {thin}"),
-        (
-            report.points - report.copies < FEW_POINTS,
-            f"fewer than {FEW_POINTS} points, too few for a shape",
-            "a denser cloud",
-        ),
+        (report.points - report.copies < FEW_POINTS, few, "a denser cloud"),
         (report.spacing > 0.1 * longest, sparse, "a denser cloud"),
         (report.noise > 0.003, f"{1e3 * report.noise:.1f} mm of noise, which blur the normals", "a nearer camera"),
         (flat, "points all in one plane, so that the thickness is a guess", "a view of two sides"),

@@ -110,14 +110,11 @@ class UncertaintyClosing:
         self.displacement = self.planes.displacement(points, contact)
         drift = STILL
         if self.reach:
-            goal = limit_norm(self.displacement[:3], self.reach)
-            drift = limit_norm(6.0 * self._level(goal - self.palm), PALM_SPEED)
+            way, table = limit_norm(self.displacement[:3], self.reach) - self.palm, self.reference.table
+            if self.raised and table is not None:  # what the palm has left of its descent is no drift
+                way = way - (way @ table.normal) * table.normal
+            drift = limit_norm(6.0 * way, PALM_SPEED)
         return self.planes.moved(self.displacement), drift
-
-    def _level(self, way: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-        """Return a vector, or its part along the table if the palm began above its planned pose."""
-        table = self.reference.table
-        return way - (way @ table.normal) * table.normal if self.raised and table is not None else way
 
     def _descend(
         self, velocity: Float[Tensor, "f 3"], observation: Observation, period: float

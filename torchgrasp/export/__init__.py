@@ -1,13 +1,8 @@
 """Export and import of grasps and surfaces in the formats of other programs."""
 
 from torchgrasp.export.foreign import ForeignGrasps, grasps_from_joints, read_foreign
-from torchgrasp.export.other_formats import (
-    check_surface_path,
-    format_graspgen,
-    largest_std,
-    save_dexgraspbench,
-    save_surface,
-)
+from torchgrasp.export.other_formats import check_surface_path, format_graspgen, largest_std
+from torchgrasp.export.other_formats import save_dexgraspbench, save_surface
 from torchgrasp.export.postures import format_grasps, format_keyframes
 from torchgrasp.export.ros_messages import format_moveit, format_trajectories
 

@@ -31,10 +31,8 @@ class FieldBatch(DistanceField):
     @classmethod
     def of(cls, fields: Sequence[SignedDistanceField]) -> "FieldBatch":
         """Join fields, with one row for each."""
-        nodes, shape = (
-            torch.cat([x.nodes for x in fields]),
-            torch.tensor([x.values.shape for x in fields], device="cpu"),
-        )
+        nodes = torch.cat([x.nodes for x in fields])
+        shape = torch.tensor([x.values.shape for x in fields], device="cpu")
         places = torch.stack([torch.cat([x.origin, x.origin.new_tensor([x.spacing])]) for x in fields])
         counts, dy = shape.prod(1), shape[:, 2]
         dx = shape[:, 1] * dy

@@ -191,11 +191,6 @@ def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[
     return distance, gradient, hessian.transpose(0, 1), variance, slope
 
 
-def distance_covariance(posterior: Posterior, x: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k k"]:
-    """Return the covariance (k, k) of the signed distances in each set of k normalised points, Eq. (8) of the paper."""
-    return combined_covariance(posterior, x[:, :, None], x.new_ones(1, 1, 1, 1))
-
-
 def combined_covariance(
     posterior: Posterior, x: Float[Tensor, "b g p 3"], weights: Float[Tensor, "#b #g m p"]
 ) -> Float[Tensor, "b v v"]:

@@ -61,7 +61,8 @@ def explain_success(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask 
     features = measure_again(grasps[0], hand, shape, GraspTask() if task is None else task)
     model = load_model(features.device)
     first, told = 0, list[Cost]()
-    values = {name: _say(float(x), unit) for (name, unit), x in zip(_units(), features[0].tolist(), strict=True)}
+    units = [pair for names in CAUSES.values() for pair in names.items()]
+    values = {name: _say(float(x), unit) for (name, unit), x in zip(units, features[0].tolist(), strict=True)}
     for cause, names in CAUSES.items():
         usual = features.clone()
         usual[:, first : first + len(names)] = model.usual[first : first + len(names)]
@@ -77,11 +78,6 @@ def measure_again(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask) -
     upright, shape = move(grasps, frame), shape.moved(frame)
     hand, friction = hand.to(grasps.joints.device, grasps.joints.dtype), float(grasps.meta["friction"])
     return measure_grasps(hand, EstimatedBody.of(shape), upright, friction, task, task.lifts(grasps.table))
-
-
-def _units() -> list[tuple[str, str]]:
-    """Return all features with their units."""
-    return [pair for names in CAUSES.values() for pair in names.items()]
 
 
 def _say(value: float, unit: str) -> str:

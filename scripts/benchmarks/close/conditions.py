@@ -12,7 +12,7 @@ from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.posterior import distance_covariance, symmetric_root
+from torchgrasp.shape.posterior import combined_covariance, symmetric_root
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values import Grasps
 
@@ -142,7 +142,8 @@ def draw_solid(shape: ShapeGP, seed: int) -> trimesh.Trimesh:
     if len(shape.walls) > 1 or not mesh.is_watertight:
         raise BadArgument("shape", "several walls, or an open surface", "one closed wall")
     anchors = farthest_points(surface.vertices, min(ANCHORS, len(surface.vertices)))
-    covariance = distance_covariance(shape, shape.normalise(surface.vertices[anchors])[None])[0]
+    x = shape.normalise(surface.vertices[anchors])[None, :, None]
+    covariance = combined_covariance(shape, x, x.new_ones(1, 1, 1, 1))[0]
     prior = float(shape.prior_block()[0, 0])
     root = symmetric_root(covariance, prior, "anchors within the domain")
     draw = root @ torch.randn(len(anchors), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

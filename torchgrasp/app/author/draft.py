@@ -8,7 +8,8 @@ import functools
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import torch
@@ -17,14 +18,14 @@ from torch import Tensor
 
 from torchgrasp.app.author.fit_shapes import ball_tip, replace_meshes, shape_points
 from torchgrasp.app.author.pads import guess_pads, is_primitive, order_by_facing, palm_of
-from torchgrasp.app.author.repair import fix_wrist, keep_below, merge_frames, repair_bodies, repair_joints, urdf_text
+from torchgrasp.app.author.repair import fix_wrist, keep_below, merge_frames, repair_bodies, repair_joints
 from torchgrasp.base import FINGERTIPS
 from torchgrasp.checks import Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
-from torchgrasp.hand.urdf import REPAIR, Mimic, Triple, Urdf, read_published
+from torchgrasp.hand.urdf import REPAIR, SIZES, Mimic, Triple, Urdf, read_published
 
 OPTIONS = {"default": 3, "four": 4, "five": 5}  # sets of fingers that a draft declares if the hand has as many
 
@@ -131,7 +132,7 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
         repairs.append(f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}")
     names = wish.name or urdf.name, file if repairs else published.path.name
     toml = _toml_text(clean, chosen, sets, guess.approach, names, seed)
-    return Draft(toml, urdf_text(clean) if repairs else "", tuple(repairs))
+    return Draft(toml, _render("hand.urdf", urdf=clean, sizes=SIZES) if repairs else "", tuple(repairs))
 
 
 def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4 _ n"]:
@@ -182,11 +183,6 @@ def _toml_text(
     urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]], approach: Triple, names: tuple[str, str], seed: int
 ) -> str:
     """Return the text of a hand.toml from pads by tip, sets of tips by option, and the names of hand and URDF file."""
-    import jinja2
-
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    engine = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
-    engine.filters["toml"] = functools.partial(json.dumps, ensure_ascii=False)
     coupling, (kp, kd) = _coupling(urdf), _gains(urdf)
     chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
     called = {tip: tip.removesuffix("_tip") for tip in pads}
@@ -194,10 +190,25 @@ def _toml_text(
         option: ([called[tip] for tip in tips], _parked(urdf, {joint for tip in tips for joint in chains[tip]}))
         for option, tips in sets.items()
     }
-    return engine.get_template("hand.toml.jinja").render(
-        name=names[0], file=names[1], urdf=urdf, approach=approach, kp=kp, kd=kd, coupling=coupling, options=options,
-        pads=pads, names=called, chains=chains, pairs=collision_pairs(urdf, coupling, seed=seed),
+    return _render(
+        "hand.toml", name=names[0], file=names[1], urdf=urdf, approach=approach, kp=kp, kd=kd, coupling=coupling,
+        options=options, pads=pads, names=called, chains=chains, pairs=collision_pairs(urdf, coupling, seed=seed),
     )  # fmt: skip
+
+
+def _render(template: str, **values: Any) -> str:
+    """Return the text of a file from its template."""
+    import jinja2
+
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    engine = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    engine.filters |= {"toml": functools.partial(json.dumps, ensure_ascii=False), "xml": _quoted}
+    return engine.get_template(f"{template}.jinja").render(values)
+
+
+def _quoted(value: str | Sequence[float]) -> str:
+    """Return the quoted value of an XML attribute, a text or numbers; negative zero is written as zero."""
+    return quoteattr(value if isinstance(value, str) else " ".join(f"{x + 0.0!r}" for x in np.ravel(value).tolist()))
 
 
 def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:

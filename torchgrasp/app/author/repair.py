@@ -1,17 +1,16 @@
-"""Repair of published URDFs: massless frames, wrists, masses, limits, coupled joints; and the text of the clean copy.
+"""Repair of published URDFs: massless frames, wrists, masses, limits, coupled joints.
 
 Every step returns the repaired URDF and a sentence for each repair.
 """
 
 import dataclasses
 import math
-import xml.etree.ElementTree as ET
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.urdf import SIZES, Joint, Link, Mimic, Shape, Triple, Urdf
+from torchgrasp.hand.urdf import Joint, Link, Mimic, Shape, Triple, Urdf
 from torchgrasp.lazy import trimesh
 
 EFFORT, VELOCITY = 1.0, 3.0  # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
@@ -226,40 +225,3 @@ def _matrix(inertia: Collection[float]) -> np.ndarray:
 
 def _triangle(inertia: np.ndarray) -> tuple[float, ...]:
     return tuple(inertia[np.triu_indices(3)].tolist())
-
-
-def urdf_text(urdf: Urdf) -> str:
-    """Return a URDF as XML text, which `read_urdf` reads without loss."""
-    robot = ET.Element("robot", name=urdf.name)
-    for x in urdf.links:
-        link = _add(robot, "link", name=x.name)
-        inertial = _add(link, "inertial")
-        _add(inertial, "origin", xyz=x.com)
-        _add(inertial, "mass", value=x.mass)
-        _add(inertial, "inertia", **dict(zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), x.inertia, strict=True)))
-        for shape in x.shapes:
-            collision = _add(link, "collision")
-            _add(collision, "origin", xyz=shape.xyz, rpy=shape.rpy)
-            sizes = [shape.size] if shape.kind == "box" else shape.size
-            _add(_add(collision, "geometry"), shape.kind, **dict(zip(SIZES[shape.kind], sizes, strict=True)))
-    for j in urdf.joints:
-        joint = _add(robot, "joint", name=j.name, type=j.kind)
-        _add(joint, "origin", xyz=j.xyz, rpy=j.rpy)
-        _add(joint, "parent", link=j.parent)
-        _add(joint, "child", link=j.child)
-        if j.kind != "fixed":
-            _add(joint, "axis", xyz=j.axis)
-            _add(joint, "limit", lower=j.lower, upper=j.upper, effort=j.effort, velocity=j.velocity)
-        if j.mimic:
-            _add(joint, "mimic", joint=j.mimic.source, multiplier=j.mimic.ratio, offset=j.mimic.offset)
-    ET.indent(robot)
-    return ET.tostring(robot, encoding="unicode") + "\n"
-
-
-def _add(above: ET.Element, tag: str, **attributes: str | float | Sequence[float]) -> ET.Element:
-    """Add an XML element whose attributes are texts, numbers or lists of numbers; negative zero is written as zero."""
-    element = ET.SubElement(above, tag)
-    for key, value in attributes.items():
-        numbers = () if isinstance(value, str) else np.ravel(value).tolist()
-        element.set(key, value if isinstance(value, str) else " ".join(f"{x + 0.0!r}" for x in numbers))
-    return element

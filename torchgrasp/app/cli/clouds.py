@@ -5,19 +5,10 @@ from typing import Annotated, Literal
 
 import torch
 
+from torchgrasp import cloud as clouds
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import Command, arguments, naming, nested, option, positional, required
 from torchgrasp.checks import Range, Seed, check_tensor
-from torchgrasp.cloud import (
-    cut_object,
-    diagnose_cloud,
-    format_report,
-    look_at,
-    partial_view,
-    remove_outliers,
-    save_cloud,
-    voxel_downsample,
-)
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.data import write_objects
@@ -45,8 +36,8 @@ class CloudCheck(Command):
         plane = as_plane(view.plane(file.cloud))
         up = view.given_vertical(plane)
         known = plane if view.table is not None else None
-        report = diagnose_cloud(file.cloud, up, known, stands=not view.no_table)
-        print(format_report(report))
+        report = clouds.diagnose_cloud(file.cloud, up, known, stands=not view.no_table)
+        print(clouds.format_report(report))
         for note in file.notes:
             print(f"{'note':12}{note}")
         refused = any(advice.refused for advice in report.advice)
@@ -87,11 +78,11 @@ class CloudCut(Command):
             raise BadArgument("--gap", self.gap, "a number of metres in [0.001, 1]")
         file = self.view.read("CLOUD", self.cloud, whole=True)
         near = None if self.point is None else check_tensor("--point", torch.tensor(self.point).double(), (3,))
-        corners = None if self.box is None else check_tensor("--box", torch.tensor(self.box).double(), (6,))
+        box = None if self.box is None else check_tensor("--box", torch.tensor(self.box).double(), (6,)).reshape(2, 3)
         up = self.view.vertical
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if up is None else up
-        thing, plane = cut_object(file.cloud, up, near, None if corners is None else corners.reshape(2, 3), self.gap)
-        save_cloud(thing, self.out, plane)
+        thing, plane = clouds.cut_object(file.cloud, up, near, box, self.gap)
+        clouds.save_cloud(thing, self.out, plane)
         inputs.print_notes(file.notes)
         if plane is None:
             print("note    no plane was found under the object")
@@ -114,9 +105,9 @@ class CloudThin(Command):
     def run(self) -> int:
         """Thin the cloud, remove outliers and write the rest; return the exit code."""
         file = self.view.read("CLOUD", self.cloud, whole=True)
-        some = voxel_downsample(file.cloud, self.voxel)
-        less = remove_outliers(some)
-        save_cloud(less, self.out, file.table)
+        some = clouds.voxel_downsample(file.cloud, self.voxel)
+        less = clouds.remove_outliers(some)
+        clouds.save_cloud(less, self.out, file.table)
         inputs.print_notes(file.notes)
         print(f"{len(less)} of {len(file.cloud)} points, {len(some) - len(less)} outliers removed, {self.out}")
         return 0
@@ -139,10 +130,10 @@ class CloudRender(Command):
         """Render the mesh by a simulated depth camera and write the cloud; return the exit code."""
         with naming(points="MESH"):
             solid = read_mesh(self.mesh)
-            pose = look_at(self.azimuth, self.elevation, self.distance, solid)
-            cloud = partial_view(solid, pose, self.points, not self.no_noise, self.seed)
+            pose = clouds.look_at(self.azimuth, self.elevation, self.distance, solid)
+            cloud = clouds.partial_view(solid, pose, self.points, not self.no_noise, self.seed)
         with naming(path="--out"):
-            save_cloud(cloud, self.out)
+            clouds.save_cloud(cloud, self.out)
         print(f"{len(cloud)} points, {self.out}")
         return 0
 

@@ -79,13 +79,12 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
 def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, faces and vertex normals of a collision shape with rounded edges, in its link's frame."""
     ball = np.asarray(trimesh.creation.icosphere(subdivisions=3 if shape.kind == "sphere" else 1, radius=1.0).vertices)
+    radius = min(EDGE, min(shape.half) / 2)  # thin plates stay plates
     if shape.kind == "sphere":
         radius, centres = shape.size[0], np.zeros((1, 3))
     elif shape.kind == "box":
-        radius = min(EDGE, min(shape.half) / 2)  # thin plates stay plates
         centres = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * (np.array(shape.half) - radius)
     else:
-        radius = min(EDGE, min(shape.half) / 2)
         tilt, turn = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 40, endpoint=False))
         ball = np.stack([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)], -1)
         rim, up = (shape.size[0] - radius) * ball[:, 3], np.array([0.0, 0.0, shape.size[1] / 2 - radius])

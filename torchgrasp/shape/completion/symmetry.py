@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,9 +15,6 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.lazy import spatial
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
 from torchgrasp.values import PointCloud
-
-if TYPE_CHECKING:
-    from scipy.spatial import KDTree
 
 MATCH_DISTANCE = 0.003  # distance [m] over which a mirrored point stops matching the cloud
 PROBES = 150  # points of the cloud that score a plane
@@ -77,7 +73,7 @@ class SymmetryScorer:
         return self.points[self.rows], self.normals[self.rows]
 
     @functools.cached_property
-    def tree(self) -> "KDTree":
+    def tree(self) -> "spatial.KDTree":
         """The k-d tree over all points of the cloud, for finding nearest neighbours."""
         return spatial.KDTree(self.points.numpy(), leafsize=32)
 
@@ -221,11 +217,9 @@ def _pick_planes(scores: Float[Tensor, "d k"], directions: Directions, across: V
 
 def _hides(directions: Directions, across: View) -> Bool[Tensor, "d"]:
     """Return which mirror planes, given by normals, can map seen points to hidden ones; all if `across` is None."""
-    return (
-        torch.ones(len(directions), dtype=torch.bool, device="cpu")
-        if across is None
-        else (directions @ across).abs() > MIN_FACING
-    )
+    if across is None:
+        return torch.ones(len(directions), dtype=torch.bool, device="cpu")
+    return (directions @ across).abs() > MIN_FACING
 
 
 def _without_slope(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror) -> list[Mirror]:
