@@ -17,8 +17,11 @@ class _Late(types.ModuleType):
 
 
 if TYPE_CHECKING:
+    import jinja2 as jinja2
     import matplotlib as matplotlib
+    import pytorch_kinematics as pytorch_kinematics
     import trimesh as trimesh
+    import yourdfpy as yourdfpy
     from PIL import Image as Image
     from PIL import ImageDraw as ImageDraw
     from PIL import ImageFont as ImageFont
@@ -27,7 +30,8 @@ if TYPE_CHECKING:
     from scipy import sparse as sparse
     from scipy import spatial as spatial
 else:
-    matplotlib, trimesh = _Late("matplotlib"), _Late("trimesh")
+    jinja2, matplotlib, pytorch_kinematics = _Late("jinja2"), _Late("matplotlib"), _Late("pytorch_kinematics")
+    trimesh, yourdfpy = _Late("trimesh"), _Late("yourdfpy")
     Image, ImageDraw, ImageFont = (_Late(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont"))
     ndimage, optimize, sparse, spatial = map(
         _Late, ("scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.spatial")

@@ -16,6 +16,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
 from torchgrasp.hand.load import find_hand, load_hand
 from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
+from torchgrasp.lazy import yourdfpy
 
 __all__ = ["BrokenLaw", "check_hand"]
 
@@ -148,8 +149,6 @@ def _inside(point: np.ndarray, shape: Shape) -> bool:
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
     """Return the largest difference of a pose entry from yourdfpy's, and the link's name."""
-    import yourdfpy
-
     urdf, poses = read_urdf(hand.urdf_path), hand.link_poses(joints).double()
     robot = yourdfpy.URDF.load(io.BytesIO(urdf.xml), load_meshes=False)
     others = torch.zeros_like(poses)

@@ -49,14 +49,6 @@ class FieldBatch(DistanceField):
         """Return the fields of some of the rows of points."""
         return dataclasses.replace(self, owner=self.owner[index])
 
-    def nearest_node(self, points: Float[Tensor, "b *k 3"]) -> Float[Tensor, "b *k"]:
-        """Return the signed distance [m] of the grid node nearest to each point, outside the grid of a border node."""
-        grid = self._grid(points)
-        node = torch.round((points - grid.origin) / grid.spacing).clamp_min_(0)
-        node = torch.minimum(node, grid.last.to(points)).long()
-        (dx, dy), (x, y, z) = grid.stride, node.unbind(-1)
-        return self.nodes[x * dx + y * dy + z + grid.first].to(points)
-
     @kept
     def _own(self) -> tuple[Float[Tensor, "r 4"], Int[Tensor, "r 14"]]:
         """The places and steps of each row."""

@@ -51,9 +51,13 @@ class DistanceField(Value, abc.ABC):
         """Return the fields of some of the rows of points; a single field is that of all rows."""
 
     @checked
-    @abc.abstractmethod
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] of the grid node nearest to each point, outside the grid of a border node."""
+        grid = self._grid(points)
+        node = torch.round((points - grid.origin) / grid.spacing).clamp_min_(0)
+        node = torch.minimum(node, grid.last.to(points)).long()
+        (dx, dy), (x, y, z) = grid.stride, node.unbind(-1)
+        return self.nodes[x * dx + y * dy + z + grid.first].to(points)
 
     @abc.abstractmethod
     def _grid(self, points: Float[Tensor, "*b 3"]) -> Grid:
@@ -110,15 +114,6 @@ class SignedDistanceField(DistanceField):
     def rows(self, index: Int[Tensor, "k"]) -> "SignedDistanceField":
         """Return the fields of some of the rows of points; this one is that of all rows."""
         return self
-
-    @checked
-    def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of the grid node nearest to each point, outside the grid of a border node."""
-        flat = 0
-        for x, low, count in zip(points.unbind(-1), self.origin.to(points), self.values.shape, strict=True):
-            node = torch.round((x - low) / self.spacing).clamp_(0, count - 1)
-            flat = node.long() if isinstance(flat, int) else flat * count + node.long()
-        return self.nodes[flat].to(points)
 
     @kept
     def _cells(self) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:

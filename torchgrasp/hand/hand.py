@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -18,9 +18,7 @@ from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
 from torchgrasp.hand.kinematics import FreeMotion, KinematicTree, chain_poses, map_directions, map_points
 from torchgrasp.hand.self_collision import SelfCollision
-
-if TYPE_CHECKING:
-    from pytorch_kinematics import Chain
+from torchgrasp.lazy import pytorch_kinematics
 
 
 class Actuator(NamedTuple):
@@ -82,7 +80,7 @@ class Hand(Value):
     name: str
     source: HandSource
     actuated: ActuatedJoints
-    chain: "Chain" = dataclasses.field(repr=False)
+    chain: "pytorch_kinematics.Chain" = dataclasses.field(repr=False)
     tree: KinematicTree = dataclasses.field(repr=False)
     tips: Fingertips = dataclasses.field(repr=False)
     approach: Float[Tensor, "3"]

@@ -7,7 +7,7 @@ the joint between them. The four tables are computed once.
 import dataclasses
 import functools
 from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -18,9 +18,7 @@ from torchgrasp.checks import checked, is_known
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy, skew
 from torchgrasp.hand.urdf import Urdf
-
-if TYPE_CHECKING:
-    from pytorch_kinematics import Chain
+from torchgrasp.lazy import pytorch_kinematics
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -160,22 +158,21 @@ def map_directions(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
     return torch.addcmul(torch.addcmul(frames[:, 0] * x, frames[:, 1], y), frames[:, 2], z)
 
 
-def chain_from_urdf(urdf: Urdf) -> "Chain":
+def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
     """Return a URDF as a pytorch-kinematics chain of independent joints, in float64: its own reader has float32."""
-    from pytorch_kinematics import chain, frame, transforms
-
+    frame = pytorch_kinematics.frame
     with torch.device("cpu"):  # the library makes some tensors on torch's default device
         frames = {urdf.root: frame.Frame(urdf.root, frame.Link(urdf.root), frame.Joint(dtype=torch.float64))}
         for j in urdf.joints:
             place = rigid(rotation_from_rpy(j.rpy), real(j.xyz))
             ranges = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
             kind = "revolute" if j.kind == "continuous" else j.kind
-            offset = transforms.Transform3d(matrix=place)
+            offset = pytorch_kinematics.Transform3d(matrix=place)
             joint = frame.Joint(j.name, offset, kind, j.axis, torch.float64, "cpu", *ranges)
             frames[j.child] = frame.Frame(j.child, frame.Link(j.child), joint)
         for j in urdf.joints:
             frames[j.parent].add_child(frames[j.child])
-        return chain.Chain(frames[urdf.root], torch.float64)
+        return pytorch_kinematics.Chain(frames[urdf.root], torch.float64)
 
 
 def tree_from_urdf(urdf: Urdf, chain: Any = None, ends: Collection[str] | None = None) -> KinematicTree:
@@ -206,7 +203,9 @@ def tree_from_urdf(urdf: Urdf, chain: Any = None, ends: Collection[str] | None =
     )
 
 
-def chain_poses(chain: "Chain", names: Sequence[str], values: Float[Tensor, "j n"]) -> Float[Tensor, "c n 4 4"]:
+def chain_poses(
+    chain: "pytorch_kinematics.Chain", names: Sequence[str], values: Float[Tensor, "j n"]
+) -> Float[Tensor, "c n 4 4"]:
     """Return the poses of a chain's frames by pytorch-kinematics, given the positions of all joints by `names`."""
     if not (torch.compiler.is_compiling() or is_known(values)):
         raise BadArgument("backend", "pytorch_kinematics inside torch.vmap", "torchgrasp: the other writes in place")
@@ -215,7 +214,7 @@ def chain_poses(chain: "Chain", names: Sequence[str], values: Float[Tensor, "j n
     return chain.forward_kinematics_tensor(values[columns].T.to(chain.dtype), analytical_grad=False)
 
 
-def pose_in_carrier(chain: "Chain", link: str) -> tuple[str, Float[Tensor, "3 4"]]:
+def pose_in_carrier(chain: "pytorch_kinematics.Chain", link: str) -> tuple[str, Float[Tensor, "3 4"]]:
     """Return a link's carrier (the nearest link, itself or above, that a joint moves), and the link's pose in it."""
     *above, carrier = chain.parents_indices[chain.frame_to_idx[link]].tolist()
     pose = _tables(chain, 0)[0]
@@ -226,7 +225,7 @@ def pose_in_carrier(chain: "Chain", link: str) -> tuple[str, Float[Tensor, "3 4"
     return chain.idx_to_frame[carrier], pose
 
 
-def _tables(chain: "Chain", frame: int) -> Float[Tensor, "4 3 4"]:
+def _tables(chain: "pytorch_kinematics.Chain", frame: int) -> Float[Tensor, "4 3 4"]:
     """Return four 3 x 4 tables: a frame's pose in its parent is their sum, weighted by 1, sin q, cos q and q."""
     offset, kind, joint = chain.joint_offsets[frame], chain.joint_type_indices[frame], chain.joint_indices[frame]
     tables = chain.identity.new_zeros(4, 3, 4)

@@ -18,6 +18,7 @@ from torchgrasp.checks import checked
 from torchgrasp.errors import HandFileError
 from torchgrasp.files import read_bounded
 from torchgrasp.hand.safe_xml import SIZES, parse_urdf
+from torchgrasp.lazy import yourdfpy
 from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
 REPAIR = "(torchgrasp hand new writes a clean copy)"
@@ -150,8 +151,6 @@ def read_published(path: Path | str) -> Urdf:
 @functools.lru_cache(maxsize=16)
 def _parse(path: Path, data: bytes) -> Urdf:
     """Return a file's bytes as checked values; the latest files are kept, as many callers read the same hand again."""
-    import yourdfpy
-
     clean = parse_urdf(path, data)  # links and joints alone, each with all of its names and with finite numbers
     xml = ET.tostring(clean)
     robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot

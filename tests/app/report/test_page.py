@@ -6,8 +6,8 @@ from html.parser import HTMLParser
 import pytest
 
 from tests.scores import SCORES
-from torchgrasp.app.report.evaluation import draw_bar, format_evaluation, write_evaluation
-from torchgrasp.app.report.page import format_page, grasp_rows, write_report
+from torchgrasp.app.report.evaluation import format_evaluation, write_evaluation
+from torchgrasp.app.report.page import format_page, grasp_rows, templates, write_report
 from torchgrasp.app.report.run import closing_sentence, refusal, verdict
 from torchgrasp.app.report.viewer import write_viewer
 from torchgrasp.errors import OutputError, Status
@@ -119,7 +119,8 @@ def test_the_page_of_an_evaluation_shows_shares_objects_and_reasons_and_no_text_
 
 def test_a_bar_ends_where_the_interval_does():
     found = share_over({"tin": (1, 4), "cup": (2, 6)})
-    ends = [float(x) for x in re.findall(r'x[12]="([\d.]+)"', draw_bar(found, 180))[2:]]
-    at = float(re.findall(r'cx="([\d.]+)"', draw_bar(found, 180))[0])
+    bar = str(templates().get_template("table.html").module.bar(found))
+    ends = [float(x) for x in re.findall(r'x[12]="([\d.]+)"', bar)[2:]]
+    at = float(re.findall(r'cx="([\d.]+)"', bar)[0])
     for drawn, value in zip((*ends, at), (found[1], found[2], found[0]), strict=True):
         assert (drawn - 4) / (180 - 8) == pytest.approx(value, abs=1e-3)

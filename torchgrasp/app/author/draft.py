@@ -26,6 +26,7 @@ from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.urdf import REPAIR, SIZES, Mimic, Triple, Urdf, read_published
+from torchgrasp.lazy import jinja2
 
 OPTIONS = {"default": 3, "four": 4, "five": 5}  # sets of fingers that a draft declares if the hand has as many
 
@@ -198,8 +199,6 @@ def _toml_text(
 
 def _render(template: str, **values: Any) -> str:
     """Return the text of a file from its template."""
-    import jinja2
-
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     engine = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     engine.filters |= {"toml": functools.partial(json.dumps, ensure_ascii=False), "xml": _quoted}

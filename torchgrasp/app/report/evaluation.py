@@ -61,7 +61,7 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
         heads=[*("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked"), *views],
         objects=_object_rows(scores, views, summary["by_object"]),
         failures=[
-            (stage, name.lower(), str(n), swatch(n / most), Status[name].sentence)
+            (stage, name.lower(), str(n), n / most, Status[name].sentence)
             for stage, reasons in summary["failures"].items()
             for name, n in reasons.items()
         ],
@@ -80,34 +80,15 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
     )  # fmt: skip
 
 
-def draw_bar(share: Share, width: int = 180) -> Any:
-    """Return an SVG of a success rate as a mark on a bar, with its interval as a line; `width` is in pixels."""
-    from markupsafe import Markup
-
-    value, low, high = (4 + (width - 8) * x for x in share[:3])
-    line = '<line x1="{:.1f}" x2="{:.1f}" y1="8" y2="8" stroke="{}" stroke-width="8"/>'
-    ends = "" if math.isnan(low) else line.format(low, high, "#8fc8bb")
-    mark = "" if math.isnan(value) else f'<circle cx="{value:.1f}" cy="8" r="4" fill="#23967f"/>'
-    scale = line.format(4, width - 4, "#e7e5de")
-    return Markup(f'<svg class="bar" viewBox="0 0 {width} 16" role="img">{scale}{ends}{mark}</svg>')
-
-
-def swatch(share: float) -> Any:
-    """Return an HTML bar that shows a success rate in [0, 1] as a fraction of 160 pixels."""
-    from markupsafe import Markup
-
-    return Markup(f'<span class="swatch" style="width:{160 * share:.0f}px"></span>')
-
-
-def _share_cells(share: Share, digits: int) -> tuple[str, ...]:
-    """Return table cells for a success rate: value, drawing, interval and number of trials."""
+def _share_cells(share: Share, digits: int) -> tuple[Any, ...]:
+    """Return table cells for a success rate: value, the share itself, which is drawn, interval and number of trials."""
     value, low, high = ("-" if math.isnan(x) else f"{x:.{digits}%}" for x in share[:3])
-    return value, draw_bar(share), f"{low} to {high}" if share.units > 1 else "-", str(share.total)
+    return value, share, f"{low} to {high}" if share.units > 1 else "-", str(share.total)
 
 
 def _object_rows(
     scores: Sequence[ViewScore], views: Sequence[str], by_object: Mapping[str, Any]
-) -> list[tuple[str, ...]]:
+) -> list[tuple[Any, ...]]:
     """Return a table row for each object: its success rates, and the outcome of each view."""
     outcome = {}
     for score in scores:

@@ -4,7 +4,7 @@ import base64
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torchgrasp.app.report import stills
 from torchgrasp.app.report.canvas import FINGERS
@@ -14,10 +14,8 @@ from torchgrasp.app.report.scene import encode_scene
 from torchgrasp.base import count_status
 from torchgrasp.checks import checked
 from torchgrasp.files import write_file
+from torchgrasp.lazy import jinja2
 from torchgrasp.values import Grasps, format_success
-
-if TYPE_CHECKING:
-    import jinja2
 
 Sections = dict[str, list[tuple[str, bytes]]]
 
@@ -139,8 +137,6 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 @functools.cache
 def templates() -> "jinja2.Environment":
     """Return the template environment of all pages; every inserted text is escaped."""
-    import jinja2
-
     loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
     return jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
