@@ -205,7 +205,7 @@ def _render(template: str, **values: Any) -> str:
     return engine.get_template(f"{template}.jinja").render(values)
 
 
-def _quoted(value: str | Sequence[float]) -> str:
+def _quoted(value: str | float | Sequence[float]) -> str:
     """Return the quoted value of an XML attribute, a text or numbers; negative zero is written as zero."""
     return quoteattr(value if isinstance(value, str) else " ".join(f"{x + 0.0!r}" for x in np.ravel(value).tolist()))
 
