@@ -66,7 +66,7 @@ def judge_view(
             found = f"a table that contradicts the cloud, {error.found}"
             advice.append(Advice(found, f"--table, {error.allowed}", True))
     if stands and eye is not None and facing >= FACING:
-        advice += _judge_height(points, eye, given, up, table, support)
+        advice += _judge_height(points, eye, given, up, table, support and support[0])
         down = float((normals @ up < -0.5).double().mean())
         if given and not any(a.refused for a in advice) and down > 0.15:  # a camera above a table sees fewer
             found = f"a vertical {_triple(up)} that {down:.0%} of the visible normals contradict: they point down"
@@ -128,12 +128,7 @@ def _judge_camera(clean: PointCloud, given: bool) -> list[Advice]:
 
 
 def _judge_height(
-    points: Points,
-    eye: Float[Tensor, "*views 3"],
-    given: bool,
-    up: Vector,
-    table: Plane | None,
-    support: tuple[Plane, float] | None,
+    points: Points, eye: Float[Tensor, "*views 3"], given: bool, up: Vector, table: Plane | None, ground: Plane | None
 ) -> list[Advice]:
     """Return advice if the camera is below the table, or below the lowest point if the table is unknown."""
     lowest = float((points @ up).min()) if table is None else table.offset
@@ -141,14 +136,14 @@ def _judge_height(
     below = lowest - float((eye @ normal).min())
     if below < 0:
         return []
-    ground = "the lowest point" if table is None else "the table"
-    place = f"{below:.2f} m below {ground} along the vertical {_triple(normal)}"
+    level = "the lowest point" if table is None else "the table"
+    place = f"{below:.2f} m below {level} along the vertical {_triple(normal)}"
     centre = points.mean(0)
     forward = float(centre[2]) > 0.6 * float(torch.linalg.vector_norm(centre)) and float(up[2]) > 0.9
     if forward and not bool(eye.any()):
         axis, why = torch.tensor([0.0, -1.0, 0.0]), "for a level camera"
-        if support is not None:
-            axis, why = support[0].normal, "the normal of the plane in it"
+        if ground is not None:
+            axis, why = ground.normal, "the normal of the plane in it"
         found = f"a cloud in its camera's frame, whose z axis points forward: the camera is {place}"
         options = f"{'' if given else '--viewpoint 0 0 0 '}--up {_triple(axis, ' ')}"
         fix = f"a vertical that points up: {options} ({why}), or --camera-pose FILE"

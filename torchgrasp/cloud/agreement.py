@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
 from torchgrasp.lazy import trimesh
@@ -14,12 +14,7 @@ from torchgrasp.values import PointCloud
 
 
 def check_agreement(
-    name: str,
-    points: Float[Tensor, "n 3"],
-    what: str,
-    other: "trimesh.Trimesh | PointCloud",
-    slack: float,
-    share: float,
+    name: str, points: Points, what: str, other: "trimesh.Trimesh | PointCloud", slack: float, share: float
 ) -> None:
     """Raise `BadArgument` if points lie off a mesh, or off a cloud and the space hidden behind the cloud.
 

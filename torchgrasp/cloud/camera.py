@@ -12,13 +12,12 @@ from torch import Tensor
 from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.pose import check_rigid
-from torchgrasp.cloud.sensor import SensorName, SensorNoise, add_noise, find_sensor
+from torchgrasp.cloud.sensor import Image, SensorName, SensorNoise, add_noise, find_sensor
 from torchgrasp.errors import MeshError
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.lazy import trimesh
 from torchgrasp.values import PointCloud
 
-Image = Float[Tensor, "h w"]
 Transform = Float[Tensor, "4 4"]
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 616.0  # columns, rows and focal length [px] of the default camera

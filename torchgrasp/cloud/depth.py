@@ -18,6 +18,7 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.values import PointCloud
 
+Array = Tensor | np.ndarray
 MIN_DEPTH, MAX_DEPTH = 0.06, 50.0  # least and greatest depth [m] that depth cameras measure
 MATRICES = ("k", "cam_k", "camera_matrix", "intrinsic_matrix", "cameraintrinsics", "cameramatrix", "data")
 """Names of a matrix of intrinsics, or of an object that holds it: of ROS, BOP, Open3D and Zivid."""
@@ -94,10 +95,7 @@ def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> F
 
 @checked
 def read_depth(
-    depth: Tensor | np.ndarray,
-    intrinsics: object,
-    mask: Tensor | np.ndarray | None = None,
-    depth_unit: Positive | None = None,
+    depth: Array, intrinsics: object, mask: Array | None = None, depth_unit: Positive | None = None
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"], Bool[Tensor, "h w"] | None]:
     """Check the arguments of `cloud_from_depth`; return depth [m] (0 if not measured), intrinsics [px] and mask."""
     k, stated, scale = _read_intrinsics(intrinsics)

@@ -32,8 +32,6 @@ class CloudFile(Value):
     """A cloud read from a file; `notes` holds a sentence for each kind of data in the file that was left out.
 
     >>> import tempfile
-    >>> from pathlib import Path
-    >>> from torchgrasp.cloud import read_cloud_file
     >>> file = Path(tempfile.mkdtemp(), "cloud.npy")
     >>> np.save(file, np.vstack([np.random.default_rng(0).random((50, 3)) * 0.1, np.full((3, 3), np.nan)]))
     >>> read_cloud_file(file).notes

@@ -17,6 +17,7 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.lazy import ndimage, optimize
 
+Image = Float[Tensor, "h w"]
 SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 """Depth cameras with a model of their noise."""
 
@@ -76,12 +77,7 @@ def find_sensor(noise: bool | SensorName | SensorNoise) -> SensorNoise | None:
     return SENSORS[noise] if isinstance(noise, str) else noise
 
 
-def add_noise(
-    depth: Float[Tensor, "h w"],
-    cosine: Float[Tensor, "h w"],
-    generator: torch.Generator,
-    sensor: SensorNoise = ACTIVE_STEREO,
-) -> Float[Tensor, "h w"]:
+def add_noise(depth: Image, cosine: Image, generator: torch.Generator, sensor: SensorNoise = ACTIVE_STEREO) -> Image:
     """Return a depth image [m] with a camera's noise, given |cosine| between each ray and the surface normal."""
     normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
     uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)

@@ -18,10 +18,7 @@ DRAWN = 2000  # most points that tell where the camera was
 
 
 def guess_viewpoint(
-    points: Points,
-    normals: Points,
-    up: Vector | None = None,
-    assumed: bool = False,
+    points: Points, normals: Points, up: Vector | None = None, assumed: bool = False
 ) -> tuple[Vector, float]:
     """Return a camera position [m] that explains a view, and the angle [deg] within which the camera is likely.
 

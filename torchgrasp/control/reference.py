@@ -241,10 +241,7 @@ def _number(grasp: Grasps, name: str) -> float | None:
 
 @checked
 def closing_gains(
-    grasp: Grasps,
-    hand: Hand,
-    force: Force = 4.0,
-    stability: "StabilityModel | None" = None,
+    grasp: Grasps, hand: Hand, force: Force = 4.0, stability: "StabilityModel | None" = None
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.
 

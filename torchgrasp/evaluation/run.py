@@ -73,15 +73,10 @@ def evaluate(
 
 
 def _evaluate(
-    views: list[View],
-    refused: list[ViewScore],
-    protocol: Protocol,
-    spec: EvaluationSpec,
-    folder: Path | None,
-    workers: int,
+    views: list[View], bad: list[ViewScore], protocol: Protocol, spec: EvaluationSpec, folder: Path | None, workers: int
 ) -> Generator[ViewScore, None, None]:
     """Plan on and try all views, and yield their scores; `evaluate` has checked the arguments."""
-    yield from refused
+    yield from bad
     with contextlib.ExitStack() as stack:
         shelf = stack.enter_context(temporary_folder()) if folder is None else Path(folder)
         if folder is not None and not spec.planned:  # grasps that are only read need no lock

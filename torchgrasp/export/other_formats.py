@@ -32,12 +32,7 @@ BENCH_HANDS = {"allegro": ([1.0, 0.0, 1.0, 0.0], tuple(f"joint_{k}" for k in ran
 
 @checked
 def save_dexgraspbench(
-    hand: Hand,
-    grasps: Grasps,
-    folder: Path | str,
-    object_path: str,
-    force: Force = 4.0,
-    kp: Positive = 5.0,
+    hand: Hand, grasps: Grasps, folder: Path | str, object_path: str, force: Force = 4.0, kp: Positive = 5.0
 ) -> list[Path]:
     """Write each grasp as a file `folder/0.npy`, `folder/1.npy` and so on, for DexGraspBench's evaluator.
 

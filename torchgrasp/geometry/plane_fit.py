@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.geometry.linalg import Points, Vector
 from torchgrasp.lazy import spatial
 
 NOISE, NOISE_GROWTH = 0.001, 0.0035
@@ -27,9 +28,7 @@ def assume_noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -
 class View:
     """One view: points [m] about their centre, their noise [m], camera position `eye`, upward direction `sky`."""
 
-    def __init__(
-        self, points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None, sky: Float[Tensor, "3"] | None
-    ) -> None:
+    def __init__(self, points: Points, eye: Vector | None, sky: Vector | None) -> None:
         self.points, self.eye, self.sky = points, eye, sky
         self.noise = assume_noise(points, eye)
 

@@ -67,10 +67,7 @@ def find_table(points: Points, viewpoint: Vector, table: Plane | float | None, u
 
 
 def find_supports(
-    points: Points,
-    viewpoint: Vector | None = None,
-    up: Vector | None = None,
-    least_width: float = LEAST_WIDTH,
+    points: Points, viewpoint: Vector | None = None, up: Vector | None = None, least_width: float = LEAST_WIDTH
 ) -> tuple[Support, ...]:
     """Return the planes that support objects in a view, the most plausible first, each with the region that it covers.
 

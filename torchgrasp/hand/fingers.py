@@ -28,8 +28,6 @@ class ActuatedJoints(Value):
 
     >>> from torchgrasp import load_hand
     >>> actuated = load_hand("barrett").actuated
-    >>> actuated.check(actuated.lower), actuated.check_limits(actuated.upper)
-    (None, None)
     >>> torch.equal(actuated.couple(actuated.lower), actuated.expand(actuated.lower))
     True
     """

@@ -65,14 +65,11 @@ class Hand(Value):
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
-    >>> hand.require_three("hand", "a model")
     >>> q = (hand.lower + hand.upper) / 2
     >>> hand.fingertips(q)[0].shape, hand.tip_centres(q).shape, hand.jacobian(q).shape
     (torch.Size([3, 3]), torch.Size([3, 3]), torch.Size([3, 3, 4]))
     >>> hand.link_poses(q).shape, hand.sphere_centres(q).shape, hand.expand_joints(q).shape
     (torch.Size([12, 4, 4]), torch.Size([117, 3]), torch.Size([8]))
-    >>> len(hand.expand(q)), bool(hand.self_clearance(q) > 0)
-    (8, True)
     >>> hand.chain.forward_kinematics(hand.expand(q[None]))["f3_tip"].get_matrix().shape
     torch.Size([1, 4, 4])
     """

@@ -14,13 +14,13 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, checked
-from torchgrasp.cloud.depth import frustum_of_image, read_depth
+from torchgrasp.cloud.depth import Array, frustum_of_image, read_depth
 from torchgrasp.cloud.pose import read_camera_pose
 from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
 from torchgrasp.files import read_bounded
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import GRID
 from torchgrasp.limits import CLOUD_BYTES
 
@@ -77,10 +77,7 @@ class DepthImage(Value):
 
 
 def read_image(
-    depth: Tensor | np.ndarray,
-    intrinsics: object,
-    camera_pose: Tensor | np.ndarray | None,
-    depth_unit: float | None = None,
+    depth: Array, intrinsics: object, camera_pose: Array | None, depth_unit: float | None = None
 ) -> DepthImage:
     """Return a checked depth image in float64 [m]; without a camera pose, its frame is the camera's own."""
     z, k, _ = read_depth(depth, intrinsics, depth_unit=depth_unit)
@@ -98,9 +95,7 @@ def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> F
     return (torch.bincount(label, weights=(own - mean[label]).square().sum(-1)) / count).sqrt()
 
 
-def image_of_cloud(
-    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"], up: Float[Tensor, "3"]
-) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
+def image_of_cloud(points: Points, viewpoint: Vector, up: Vector) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
     """Return the depth image that a pinhole camera at the viewpoint takes of a cloud, and each point's row and column.
 
     The upright camera looks at the middle of the points. A pixel covers about two points and keeps the nearest.

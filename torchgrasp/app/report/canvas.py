@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torchgrasp.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
 
 Points = Float[np.ndarray, "n 3"]
-
+Color = tuple[float, float, float]
 Direction = tuple[float, float, float]
 
 FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")
@@ -73,13 +73,7 @@ class Canvas:
         vertices = (points[:, None] + ball.vertices).reshape(-1, 3)
         self.add_mesh(vertices, faces, np.repeat(colors, k, 0), np.tile(ball.vertices, (n, 1)))
 
-    def add_arrows(
-        self,
-        points: Points,
-        directions: Points,
-        length: float,
-        colors: tuple[str, ...],
-    ) -> None:
+    def add_arrows(self, points: Points, directions: Points, length: float, colors: tuple[str, ...]) -> None:
         """Add arrows of one length [m] in unit directions, each with its colour and a small ball at its start."""
         head = trimesh.creation.cone(radius=0.1, height=0.35, sections=8)
         head.apply_translation([0.0, 0.0, 0.65])
@@ -148,11 +142,7 @@ def concatenate(parts: list[Triangles]) -> Triangles:
 
 
 def render(
-    solid: Triangles,
-    transparent: Triangles,
-    camera: Camera,
-    size: tuple[int, int],
-    background: tuple[float, float, float],
+    solid: Triangles, transparent: Triangles, camera: Camera, size: tuple[int, int], background: Color
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the pixels of a picture of opaque triangles; over them lies the nearest layer of transparent triangles."""
     samples = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
@@ -225,7 +215,7 @@ def _shade(triangles: Triangles, camera: Camera) -> Float[np.ndarray, "t 3 3"]:
     return triangles.colors * np.where(lit, light, 1.0)[..., None] + np.where(lit, shine, 0.0)[..., None]
 
 
-def rgb(color: str) -> tuple[float, float, float]:
+def rgb(color: str) -> Color:
     """Return the red, green and blue parts, each in [0, 1], of a colour written as "#rrggbb"."""
     red, green, blue = (x / 255 for x in bytes.fromhex(color[1:]))
     return red, green, blue

@@ -30,7 +30,7 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
     heights = [200 if title.endswith(":") else 110 for title, *_ in plots]
     height = STILL + sum(heights) + 50 * len(plots) + 76
     figure = Figure((WIDTH / 100, height / 100), dpi=100, facecolor=paint.PAPER)
-    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction, (WIDTH // count, STILL - TITLE))
+    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction)
     for k, (still, moment) in enumerate(zip(stills, moments, strict=True)):
         axis = figure.add_axes((k / count, 1 - STILL / height, 1 / count, (STILL - TITLE) / height))
         axis.imshow(still, aspect="auto")
@@ -74,12 +74,7 @@ def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:
 
 
 def _draw_stills(
-    mesh: "trimesh.Trimesh",
-    hand: Hand,
-    closure: ClosureResult,
-    ticks: list[int],
-    direction: Direction,
-    size: tuple[int, int],
+    mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, ticks: list[int], direction: Direction
 ) -> list[np.ndarray]:
     """Return pictures of the hand and the object at the given ticks, all at the same scale."""
     finite = torch.nonzero(closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1))[:, 0]
@@ -93,7 +88,7 @@ def _draw_stills(
     inside = [place - b for place, b in zip(places, base, strict=True)]
     near = [x for x in inside if np.abs(x.mean(0) - inside[0].mean(0)).max() < 0.25]  # a lost object is not framed
     seen = np.concatenate([*near, *(s.vertices - b for solids, b in zip(hands, base, strict=True) for s in solids)])
-    pictures = []
+    pictures, size = [], (WIDTH // len(ticks), STILL - TITLE)
     for place, solids, b in zip(places, hands, base, strict=True):
         canvas = paint.Canvas()
         canvas.add_mesh(place, faces, paint.OBJECT)
