@@ -49,11 +49,8 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
 def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)]) -> PointCloud:
     """Return a thinned cloud with one point of each voxel, the nearest to the voxel's centre, in the given order.
 
-    The grid starts at the cloud's lowest corner. Points are not averaged, since a mean may lie inside a thin wall.
-
-    Args:
-        cloud: points [m].
-        voxel: side of a voxel [m].
+    The grid of voxels of side `voxel` [m] starts at the lowest corner of the cloud. Points are not averaged, since a
+    mean may lie inside a thin wall.
 
     Raises:
         BadArgument, SuspiciousScale: see `check_cloud`.

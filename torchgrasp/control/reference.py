@@ -88,7 +88,6 @@ class ClosingReference(Value):
         """Return the closing plan of one grasp, on the CPU.
 
         Args:
-            hand: the hand.
             grasp: a single grasp, planned for the hand.
             force: normal force of the strongest finger [N].
             kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.

@@ -145,12 +145,9 @@ class FingertipSensor:
         self.alive, self.whole = reference.alive, bool(reference.alive.all())
 
     def __call__(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"], period: float) -> TactileState:
-        """Return what the fingertip sensors report at the end of a control tick, delayed as the sensor is.
+        """Return what the sensors report at the end of a control tick of `period` [s], delayed as the sensor is.
 
-        Args:
-            truth: true contacts during the tick.
-            jacobian: Jacobian of the fingertips by all joints [m/rad].
-            period: period of the tick [s].
+        `truth` holds the true contacts during the tick, `jacobian` is that of the fingertips by all joints [m/rad].
         """
         reference, before = self.reference, self.sensed
         if self.model.kind == "torque":

@@ -90,7 +90,6 @@ def measure(
 
     Args:
         tactile: the state at the last tick.
-        truth: true contacts during the tick.
         pads: outward surface normals at the planned contacts, which direct the noise of tips that touch nothing.
         radius: radius of the tips [m]; 0 means that they are not round, and 12 mm is assumed.
         period: period of the tick [s].

@@ -58,7 +58,6 @@ def read_foreign(
     | `.npz` with `grasp_qpos` (DexGraspBench) | rows of pose and joints; `pregrasp_qpos`, if it is there |
 
     Args:
-        path: the file.
         hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are known.
         order: names (as in the hand's URDF) of the joints in the file; other names are ignored.
         quaternion: order of the numbers in a pose, after its position.
@@ -174,7 +173,6 @@ def grasps_from_joints(
     approach is the hand's own approach axis.
 
     Args:
-        hand: the grasping hand.
         joints: actuated joints [rad], in the order of `hand.joint_names`.
         obj_from_hand: poses of the root link of the hand's URDF.
         pregrasp: joints of the opened hand; by default each tip moves 20 mm off its contact, or as far as limits allow.

@@ -250,7 +250,6 @@ class Hand(Value):
         of the distance, exact where a face is nearest.
 
         Args:
-            joints: actuated joints (.., h).
             below: separations above this value [m] may be inexact lower bounds, which is faster.
             chunk: number of postures computed at a time, which bounds the memory.
         """

@@ -43,7 +43,6 @@ def explain_success(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask 
 
     Args:
         grasps: from `plan_grasps`, with the hand; at least one.
-        hand: the hand of the grasps.
         shape: the estimated shape, in the frame of the grasps.
         task: the task of the grasps; by default `GraspTask()`.
 

@@ -63,11 +63,9 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
     """Return the text of a hand.toml for a clean URDF, to be reviewed by the user and checked by `check_hand`.
 
     Args:
-        path: the URDF.
         tips: links of the fingertips in grasp order, first the three of option "default"; "four" and "five" add the
             next tips. By default the last links of the branches, in the order in which their pads best face each other.
         name: name of the hand; by default the name of the robot.
-        seed: random seed.
 
     Raises:
         HandFileError: the URDF is missing or malformed, or needs repair by `new_hand`.
@@ -87,12 +85,6 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
 @checked
 def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = "hand.urdf") -> Draft:  # noqa: B008
     """Repair a published URDF, and draft a hand.toml for the clean copy, which the user saves as `file`.
-
-    Args:
-        path: the URDF.
-        wish: the user's choices.
-        seed: random seed.
-        file: name of the clean copy.
 
     Raises:
         HandFileError: the URDF or one of its meshes is missing, malformed or hostile, or cannot be repaired.

@@ -23,13 +23,7 @@ SHARE_NAMES = {
 
 @checked
 def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> Path:
-    """Write the HTML page with an evaluation's settings and scores, atomically.
-
-    Args:
-        path: file to write.
-        title: heading of the page.
-        asked: settings of the evaluation by name.
-        scores: results of `evaluate`.
+    """Write the HTML page with a title, an evaluation's settings by name, and the results of `evaluate`, atomically.
 
     Returns the path. Raises `OutputError` if the file cannot be written.
 

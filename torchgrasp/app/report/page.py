@@ -27,12 +27,8 @@ GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle d
 def write_report(path: Path | str, run: Run, view: str = "") -> Path:
     """Write the report of a run, with its pictures, as one HTML file, atomically.
 
-    Args:
-        path: file to write.
-        run: the run to show.
-        view: file name of the 3D page that `write_viewer` wrote beside the report, for a link.
-
-    Returns the path. Raises `OutputError` if the file cannot be written.
+    `view` is the file name of the 3D page that `write_viewer` wrote beside the report, for a link. Returns the path.
+    Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object

@@ -38,17 +38,10 @@ class Run:
     Args:
         object_name: name of the object in titles and sentences.
         source: file of the cloud or the scene.
-        cloud: points of the object.
-        hand: the hand that grasps.
-        spec: constraints on the contacts.
-        surface: the estimated surface.
-        grasps: the planned grasps, best first.
         stages: name, result and wall time [s] of each stage.
-        plan: planned contacts.
         mesh: the true object [m], in the frame of the cloud.
         closure: result of closing on the true object; only with `mesh`.
         scene: the scene that the cloud was cut from.
-        explanation: why no grasp is executable.
         costs: what lowers the predicted success of the best grasp most.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
