@@ -113,9 +113,8 @@ class Batch(Value):
     def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:
         """Return a batch of the rows that a slice, a mask or indices select. A single index gives a batch of one row.
 
-        Raises:
-            BadArgument: the index is of another kind, such as a single boolean.
-            IndexError: a single index is out of range.
+        Raises `BadArgument` for an index of another kind, such as a single boolean, and `IndexError` beyond the last
+        row.
         """
         chosen = read_rows(rows, len(self))  # once for all tensors: on a GPU the host waits for the number of rows
         return map_tensors(lambda x: x[chosen], self)

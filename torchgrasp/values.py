@@ -34,9 +34,8 @@ class PointCloud(Value):
         frustum: inward unit normals of the four sides of the camera's view, or of each point's camera; None if unknown.
             An object that reaches a side is cut off there.
 
-    Raises:
-        BadArgument: wrong shape, dtype or non-finite numbers.
-        TooFewPoints: fewer than 4 points.
+    Raises `BadArgument` for a wrong shape or dtype or numbers that are not finite, `TooFewPoints` for fewer than 4
+    points.
 
     >>> import torch
     >>> cloud = PointCloud(torch.rand(100, 3), viewpoint=torch.eye(3)[:2].repeat_interleave(50, 0))

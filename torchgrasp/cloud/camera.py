@@ -40,9 +40,7 @@ def look_at(
         distance: distance of the camera from the target [m], in [0.01, 10].
         target: point (3,) [m] in the middle of the image; or a mesh for the centre of its box, or None for the origin.
 
-    Raises:
-        BadArgument: an angle or a distance outside its range.
-        MeshError: the mesh has no faces.
+    Raises `BadArgument` for an angle or a distance outside its range, and `MeshError` for a mesh without faces.
 
     >>> look_at(0.0, 0.0, 0.5)[:3, 3]
     tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)

@@ -50,11 +50,8 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
     """Return a thinned cloud with one point of each voxel, the nearest to the voxel's centre, in the given order.
 
     The grid of voxels of side `voxel` [m] starts at the lowest corner of the cloud. Points are not averaged, since a
-    mean may lie inside a thin wall.
-
-    Raises:
-        BadArgument, SuspiciousScale: see `check_cloud`.
-        TooFewPoints: fewer than 4 voxels hold points.
+    mean may lie inside a thin wall. Raises the errors of `check_cloud`, and `TooFewPoints` if fewer than 4 voxels hold
+    points.
 
     >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
     True

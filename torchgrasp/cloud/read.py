@@ -138,9 +138,7 @@ def cloud_from_array(
 def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) -> Path:
     """Write a cloud, and its table if given, as `.npz` (exact) or binary `.ply` (float32), in one atomic step.
 
-    Raises:
-        BadArgument: another suffix; several views for `.ply`, which has one viewpoint.
-        OutputError: the file cannot be written.
+    Raises `OutputError`, and `BadArgument` for another suffix, or several views for `.ply`, which has one viewpoint.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):

@@ -62,9 +62,7 @@ def read_foreign(
         order: names (as in the hand's URDF) of the joints in the file; other names are ignored.
         quaternion: order of the numbers in a pose, after its position.
 
-    Raises:
-        BadArgument: an order that misses a joint of the hand.
-        ModelFileError: a missing or malformed file, or numbers that are not finite.
+    Raises `ModelFileError` for a missing or malformed file, and `BadArgument` for an order that misses a joint.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand

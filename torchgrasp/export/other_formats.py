@@ -48,9 +48,7 @@ def save_dexgraspbench(
         force: normal force of the strongest finger [N].
         kp: stiffness of the bench's drives [N m/rad].
 
-    Raises:
-        BadArgument: a hand that is not in the bench, or joints of another hand.
-        OutputError: the folder cannot be written.
+    Raises `OutputError`, and `BadArgument` for a hand that is not in the bench, or joints of another hand.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -112,11 +110,8 @@ def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
 def save_surface(surface: Surface, path: Path | str) -> Path:
     """Write a surface with its uncertainty as colours to `.ply` (with `std_m` [m] of each vertex) or `.glb`.
 
-    Yellow marks a standard deviation of `largest_std`, violet 0.
-
-    Raises:
-        BadArgument: another suffix.
-        OutputError: the file cannot be written.
+    Yellow marks a standard deviation of `largest_std`, violet 0. Raises `OutputError`, and `BadArgument` for another
+    suffix.
 
     >>> import tempfile
     >>> from torchgrasp import fit_shape, load_object

@@ -61,9 +61,8 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
             the names of three to five fingers in grasp order. Joints of other fingers are parked where an option parks
             them, else at zero or the limit nearest to zero.
 
-    Raises:
-        HandFileError: a file is missing or malformed, or the two files do not fit each other.
-        BadArgument: the hand has no such option or fingers.
+    Raises `HandFileError` if a file is missing or malformed, or the two do not fit, and `BadArgument` for unknown
+    fingers.
 
     >>> load_hand("allegro", ("index", "ring", "thumb")).finger_names
     ('index', 'ring', 'thumb')
@@ -107,9 +106,7 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
         grasps: grasps of `plan_grasps`, also loaded from a file.
         hand: the same hand with any fingers, its name or its folder; by default the shipped hand that the grasps name.
 
-    Raises:
-        BadArgument: grasps that name no hand, another hand, or fingers that the hand does not have.
-        HandFileError: see `load_hand`.
+    Raises the errors of `load_hand`, and `BadArgument` for grasps that name no hand, another hand, or unknown fingers.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand_of(load_shipped_grasp("jug", "barrett")).name

@@ -21,11 +21,8 @@ def read_scene(path: Path | str) -> Scene:
     The file has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are `camera_pose` (4, 4), the
     objects' `labels` or the target's `mask` (h, w), the label `target`, the `table` (4,) as normal and offset, and
     `given`, the labels that the user made. If `given` is missing, the user made all labels, unless there is a table, as
-    in scenes that the library saved.
-
-    Raises:
-        CloudFileError: no such file, or malformed content.
-        BadArgument: see `Scene.from_depth`.
+    in scenes that the library saved. Raises the errors of `Scene.from_depth`, and `CloudFileError` for no such file, or
+    malformed content.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
@@ -49,9 +46,7 @@ def read_scene(path: Path | str) -> Scene:
 def save_scene(scene: Scene, path: Path | str) -> Path:
     """Write a scene as .npz, atomically: depth in float32, labels, camera, table and target; `read_scene` reads it.
 
-    Raises:
-        BadArgument: another suffix.
-        OutputError: the file cannot be written.
+    Raises `OutputError`, and `BadArgument` for another suffix.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene

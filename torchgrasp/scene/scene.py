@@ -272,9 +272,7 @@ class Scene(Value):
     def cloud(self, label: int | None = None) -> PointCloud:
         """Return the points of an object, by default the target, with the camera as viewpoint.
 
-        Raises:
-            BadArgument: a label without points, or no target.
-            TooFewPoints: fewer than 4 points.
+        Raises `BadArgument` for a label without points or no target, and `TooFewPoints` for fewer than 4 points.
         """
         rows, frustum = self.rows_of(label), self.image.frustum
         if not bool(rows.any()):
