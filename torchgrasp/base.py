@@ -107,7 +107,6 @@ class Batch(Value):
     """A value whose tensors share their first axis, the rows. An index selects rows; `len` is their number."""
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return len(getattr(self, dataclasses.fields(self)[0].name))  # pyright: ignore[reportArgumentType]
 
     def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:

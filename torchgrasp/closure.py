@@ -181,7 +181,6 @@ class ClosingOptions(Value):
     attempts: Annotated[int, Range(1, 100)] = 5
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` for an option without another option that it needs."""
         if not self.pose_estimate and (self.palm_reach or self.attempts > 1):
             found = f"a reach of {self.palm_reach:g} m and {self.attempts} attempts without pose_estimate"
             raise BadArgument("palm_reach", found, "0 m and 1 attempt")

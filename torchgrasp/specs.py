@@ -242,7 +242,6 @@ class TrialSpec(Value):
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` if fields contradict each other."""
         choose_options(self.closing, self.options)
         check_modes(self.sensor, self.closing, self.pressing)
         if self.max_force is not None and self.force is not None and self.force > self.max_force:

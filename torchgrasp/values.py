@@ -49,12 +49,10 @@ class PointCloud(Value):
     frustum: Float[Tensor, "4 3"] | Float[Tensor, "n 4 3"] | None = None
 
     def __post_init__(self) -> None:
-        """Check the number of points."""
         if len(self.points) < 4:
             raise TooFewPoints("points", f"{len(self.points)} points", "at least 4 points")
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.points)
 
     @checked
@@ -124,7 +122,6 @@ class Contacts(Batch):
     std_m: Annotated[Float[Tensor, "b f"], ANY] | None = None
 
     def __post_init__(self) -> None:
-        """Check that all tensors have the same dtype."""
         found = {str(x.dtype) for x in (self.points, self.normals, self.variance, self.std_m) if x is not None}
         if len(found) > 1:
             raise BadArgument("contacts", " beside ".join(sorted(found)), "one dtype for all")

@@ -35,7 +35,6 @@ class Advice(Value):
     refused: bool
 
     def __str__(self) -> str:
-        """Return the advice as one sentence."""
         return f"{self.found}: {self.fix}"
 
 

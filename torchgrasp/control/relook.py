@@ -27,13 +27,6 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
         surface: signed distances from the estimated surface (`surface_field`).
         cloud: a new view of the object [m], in the frame of the surface.
         table: the table in this frame.
-
-    >>> ball = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3).norm(dim=1).reshape(41, 41, 41) - 0.05
-    >>> directions = unit(torch.cartesian_prod(*[torch.linspace(-1, 1, 6)] * 3))
-    >>> seen = torch.tensor([0.04, -0.02, 0.0]) + 0.05 * directions
-    >>> surface = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball)
-    >>> relocate(surface, PointCloud(seen), Plane.horizontal(-0.05))[:3, 3].round(decimals=2) + 0.0
-    tensor([ 0.0400, -0.0200,  0.0000], dtype=torch.float64)
     """
     most, best, steps = 300, 16, 20  # points of the cloud, places of the grid, and steps from each of them
     rows = torch.linspace(0, len(cloud) - 1, min(len(cloud), most)).round().long()

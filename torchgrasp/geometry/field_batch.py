@@ -13,20 +13,12 @@ from torchgrasp.geometry.signed_distance import DistanceField, Grid, SignedDista
 
 @dataclasses.dataclass(frozen=True)
 class FieldBatch(DistanceField):
-    """The fields of c objects as one: row r of all points that a method is given belongs to field `owner[r]`.
+    """The fields of c objects as one: row r of all points that a method is given belongs to field `owner[r]`."""
 
-    Args:
-        nodes: the values of all fields, one after another.
-        places: origin and spacing [m] of the nodes of each field.
-        steps: of each field the last node on each axis, the strides on the x and y axis, the first value, and the steps
-            to the corners of a cell.
-        owner: the field of each row.
-    """
-
-    nodes: Float[Tensor, "n"]
-    places: Float[Tensor, "c 4"]
-    steps: Int[Tensor, "c 14"]
-    owner: Int[Tensor, "r"]
+    nodes: Float[Tensor, "n"]  # the values of all fields, one after another
+    places: Float[Tensor, "c 4"]  # origin and spacing [m] of the nodes of each field
+    steps: Int[Tensor, "c 14"]  # of each field: last nodes, strides on x and y, first value, steps to a cell's corners
+    owner: Int[Tensor, "r"]  # the field of each row
 
     @classmethod
     def of(cls, fields: Sequence[SignedDistanceField]) -> "FieldBatch":

@@ -22,22 +22,14 @@ FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an est
 
 
 class Grid(NamedTuple):
-    """The grid of points, or of each row of points.
+    """The grid of points, or of each row of points."""
 
-    Args:
-        origin, spacing: of the nodes [m].
-        last: the last node on each axis.
-        stride: number of values between neighbours on the x and on the y axis.
-        first: the first value.
-        corners: steps from the first corner of a cell to all corners, among the values.
-    """
-
-    origin: Float[Tensor, "*b 3"]
-    spacing: float | Float[Tensor, "*b 1"]
-    last: Int[Tensor, "*b 3"]
-    stride: Any
-    first: Any
-    corners: Int[Tensor, "8 *b"]
+    origin: Float[Tensor, "*b 3"]  # [m]
+    spacing: float | Float[Tensor, "*b 1"]  # of the nodes [m]
+    last: Int[Tensor, "*b 3"]  # node on each axis
+    stride: Any  # number of values between neighbours on the x and on the y axis
+    first: Any  # place of the first value
+    corners: Int[Tensor, "8 *b"]  # steps from the first corner of a cell to all corners, among the values
 
 
 class DistanceField(Value, abc.ABC):

@@ -128,7 +128,6 @@ class Fingertips(Value):
     carrier_from_tip: Float[Tensor, "3 4 f 1"]
 
     def __len__(self) -> int:
-        """Return the number f of fingertips."""
         return len(self.names)
 
     @kept

@@ -15,22 +15,14 @@ from torchgrasp.shape.surface import collision_field, extract_mesh
 
 
 class EstimatedBody(NamedTuple):
-    """What the planner knows of an object, in an upright frame, whose z axis points up; or of the object of each row.
-
-    Args:
-        shape: the posterior.
-        field: signed distances from the estimated surface.
-        center: the mean [m] of the surface's vertices, which is taken for the centre of mass.
-        size: half the size [m]: the length of a normalised unit.
-        height, breadth: extent [m] along z, and lesser deviation [m] of the vertices in the plane across z.
-    """
+    """What the planner knows of an object, in an upright frame, whose z axis points up; or of the object of each row."""
 
     shape: ShapeGP | ShapeBatch
-    field: DistanceField
-    center: Float[Tensor, "*b 3"]
-    size: PerRow
-    height: PerRow
-    breadth: PerRow
+    field: DistanceField  # of the estimated surface
+    center: Float[Tensor, "*b 3"]  # the mean [m] of the surface's vertices, which is taken for the centre of mass
+    size: PerRow  # half the size [m]: the length of a normalised unit
+    height: PerRow  # extent [m] along z
+    breadth: PerRow  # lesser deviation [m] of the vertices in the plane across z
 
     @classmethod
     def of(cls, shape: ShapeGP) -> "EstimatedBody":

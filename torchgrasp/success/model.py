@@ -20,29 +20,17 @@ MODEL, KIND = Path(__file__).with_name("model.safetensors"), "success-model"
 
 @dataclasses.dataclass(frozen=True)
 class SuccessModel(Value):
-    """Boosted trees: t trees of m nodes, of which the first is the root. A leaf is its own child.
+    """Boosted trees: t trees of m nodes, of which the first is the root. A leaf is its own child."""
 
-    Args:
-        feature: the feature that a node reads.
-        threshold: a grasp goes to the first child where the feature is at most this.
-        children: the two children of each node.
-        value: the log-odds that a leaf adds; 0 in other nodes.
-        start: log-odds without any tree.
-        range: least and greatest value of each feature in the trials.
-        usual: the median of each feature among grasps that held.
-        bands: log-odds in ascending order, each with the least and greatest share of grasps that held there.
-        kept: trials of the best grasp for a task: log-odds, 1 if it held, and the number of the family.
-    """
-
-    feature: Int[Tensor, "t m"]
-    threshold: Float[Tensor, "t m"]
+    feature: Int[Tensor, "t m"]  # the feature that a node reads
+    threshold: Float[Tensor, "t m"]  # a grasp goes to the first child where the feature is at most this
     children: Int[Tensor, "t m 2"]
-    value: Float[Tensor, "t m"]
-    start: Float[Tensor, ""]
-    range: Float[Tensor, "k 2"]
-    usual: Float[Tensor, "k"]
-    bands: Float[Tensor, "n 3"]
-    kept: Float[Tensor, "r 3"]
+    value: Float[Tensor, "t m"]  # the log-odds that a leaf adds; 0 in other nodes
+    start: Float[Tensor, ""]  # log-odds without any tree
+    range: Float[Tensor, "k 2"]  # least and greatest value of each feature in the trials
+    usual: Float[Tensor, "k"]  # the median of each feature among grasps that held
+    bands: Float[Tensor, "n 3"]  # log-odds in ascending order, each with the least and greatest share that held there
+    kept: Float[Tensor, "r 3"]  # trials of the best grasp for a task: log-odds, 1 if it held, the number of the family
 
     def log_odds(self, features: Float[Tensor, "g k"]) -> Float[Tensor, "g"]:
         """Return the log-odds of success of grasps with the given `FEATURES`."""

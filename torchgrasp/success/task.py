@@ -36,8 +36,7 @@ class GraspTask(Value):
     displaced: bool = False
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` for a lift in open loop, which no trial has tested."""
-        if self.lift and self.closing == "open_loop":
+        if self.lift and self.closing == "open_loop":  # no trial has tested it
             raise BadArgument("closing", "'open_loop' for a lift", "'uncertainty'")
 
     def describe(self) -> str:
