@@ -169,7 +169,7 @@ seen = []
 def watch(event, arguments):
     if event == "open":
         path = os.path.realpath(os.fsdecode(arguments[0])) if not isinstance(arguments[0], int) else ""
-        if not path.startswith(str(folder)) and not path.endswith("author/hand.toml.jinja"):  # the library's own
+        if not path.startswith(str(folder)) and not path.endswith((".toml.jinja", ".urdf.jinja")):  # the library's own
             seen.append(f"open {path}")
     elif event.split(".")[0] in ("socket", "subprocess", "ctypes", "pickle", "urllib") or event in (
         "os.system", "os.exec", "os.posix_spawn", "os.fork", "os.remove", "os.rename"
