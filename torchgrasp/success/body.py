@@ -15,7 +15,7 @@ from torchgrasp.shape.surface import collision_field, extract_mesh
 
 
 class EstimatedBody(NamedTuple):
-    """What the planner knows of an object, or of the object of each row, in an upright frame, whose z axis points up."""
+    """What the planner knows of an object, or of the object of each row, in an upright frame: its z axis points up."""
 
     shape: ShapeGP | ShapeBatch
     field: DistanceField  # of the estimated surface
