@@ -107,8 +107,7 @@ def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
         xx, xy, xz, yy, yz, zz = link.inertia
         principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         if principal[0] <= 0 or principal[0] + principal[1] < principal[2] * (1 - 1e-6):
-            found = f"link {link.name} of principal inertias {principal}"
-            yield urdf.wrong(found, "positive, any two >= the third")
+            yield urdf.wrong(f"link {link.name} of principal inertias {principal}", "positive, any two >= the third")
 
 
 def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileError]:

@@ -95,8 +95,7 @@ def partial_view(
     if (sensor := find_sensor(noise)) is not None:
         depth = add_noise(depth, cosine, generator, sensor)
     cloud = cloud_from_depth(depth, INTRINSICS, camera_pose=pose)
-    rows = torch.randperm(len(cloud), generator=generator)[:n]
-    return cloud.select(rows)
+    return cloud.select(torch.randperm(len(cloud), generator=generator)[:n])
 
 
 def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Image, Image]:

@@ -86,8 +86,7 @@ def find_plausible(
     except NoSupport:
         middle = float(((points - eye) @ pose[:3, 2]).median())
         if table is None and not 0.15 < middle < 4.0:
-            found = f"a median depth of {middle:.3g} m, and no table"
-            raise BadArgument("depth", found, UNIT) from None
+            raise BadArgument("depth", f"a median depth of {middle:.3g} m, and no table", UNIT) from None
         if up is not None and table is None and not _is_own(pose):
             with contextlib.suppress(NoSupport):
                 _check_normals(find_table(points, eye, None, None), pose, up)

@@ -106,8 +106,7 @@ def run_lift(driver: TrialDriver) -> ClosureResult:
     """Run a lift trial in a fresh scene."""
     started = time.perf_counter()
     lift = _Lift(driver.open())
-    status = lift.perform()
-    return lift.result(status, time.perf_counter() - started)
+    return lift.result(lift.perform(), time.perf_counter() - started)
 
 
 class _ObjectLost(Exception):

@@ -90,8 +90,7 @@ def format_trajectories(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Posi
     >>> text.count("time_from_start")
     3
     """
-    trajectories = _trajectories(hand, grasps, force, kp)
-    return _document(hand, "a trajectory_msgs/JointTrajectory for each grasp", trajectories)
+    return _document(hand, "a trajectory_msgs/JointTrajectory for each grasp", _trajectories(hand, grasps, force, kp))
 
 
 def _trajectories(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> Iterator[dict[str, Any]]:

@@ -114,8 +114,7 @@ def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) ->
     """Return the bytes of a safetensors file that names its `kind`; equal tensors and metadata give equal bytes."""
     contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}  # a file shares no memory
     # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
-    header = {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)}
-    return save(contiguous, header)
+    return save(contiguous, {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)})
 
 
 def load_tensors(

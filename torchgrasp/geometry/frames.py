@@ -44,8 +44,7 @@ def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Return the skew-symmetric matrix of the cross product with v: `skew(v) @ w == v x w`."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
-    rows = [torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))]
-    return torch.stack(rows, -2)
+    return torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
 
 
 def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:

@@ -164,8 +164,7 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
         kept = ~settled[owner]
         shapes, owner = shapes.only(kept), owner[kept]
         _limit_near(urdf, shapes, chunks[0], n - done, HAND_SEPARATIONS)
-    meeting = links[(near > 0) & (met <= ALWAYS * n)]
-    return [(tree.link_names[i], tree.link_names[j]) for i, j in meeting.tolist()]
+    return [(tree.link_names[i], tree.link_names[j]) for i, j in links[(near > 0) & (met <= ALWAYS * n)].tolist()]
 
 
 def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int) -> None:

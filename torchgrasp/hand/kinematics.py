@@ -143,8 +143,7 @@ class FreeMotion(Value):
 
     def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
         """Return the coordinates of each group of markers in the root's frame, given all link frames."""
-        product = self.product.to(frames).expand(3, -1, -1)
-        return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
+        return torch.bmm(self.product.to(frames).expand(3, -1, -1), frames.flatten(1, 2)).split(self.sizes, 1)
 
 
 def map_points(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:

@@ -108,8 +108,7 @@ class SelfCollision(Value):
 
     def link_pairs(self) -> list[tuple[int, int]]:
         """Return the link indices of each pair of links that is tested."""
-        links = torch.unique(self.link[self.pairs].sort(1).values, dim=0)
-        return [(int(one), int(two)) for one, two in links]
+        return [(int(one), int(two)) for one, two in torch.unique(self.link[self.pairs].sort(1).values, dim=0)]
 
     def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
         """Return the shapes' axes and centres in the palm's frame, given the link frames."""

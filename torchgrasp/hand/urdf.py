@@ -178,8 +178,7 @@ def _link(link: Any, element: ET.Element) -> Link:
         return Link(link.name, 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
     com, rpy = _place(body.origin, element.find("inertial/origin"))
     turn, inertia = body.origin[:3, :3] if any(rpy) else np.eye(3), body.inertia
-    turned = (turn @ inertia @ turn.T)[np.triu_indices(3)].tolist()
-    return Link(link.name, body.mass, com, tuple(turned), shapes)
+    return Link(link.name, body.mass, com, tuple((turn @ inertia @ turn.T)[np.triu_indices(3)].tolist()), shapes)
 
 
 def _shape(collision: Any, element: ET.Element) -> Shape:

@@ -79,8 +79,7 @@ class Checkpoint:
             raise ModelFileError("checkpoint", f"{path}: a step on {step_rows!r} rows", f"one of {list(sizes)}")
         components = Components(tensors["weights"], tensors["means"], tensors["covariances"])
         state = tensors["reseeded"], tensors["log_likelihood"], meta.get("jumped") == "True", sizes[step_rows]
-        progress = Progress(components, *state)
-        return progress.to(self.centre.device)
+        return Progress(components, *state).to(self.centre.device)
 
 
 @checked

@@ -34,8 +34,7 @@ class Subsets:
         if len(sizes) == 1:
             return Subsets(shard, sizes)
         place = torch.randperm(n, generator=torch.Generator().manual_seed(seed), device="cpu")
-        here = place.split(shard.lengths().tolist())[shard.rank]
-        return Subsets(shard, sizes, here.to(shard.rows.device))
+        return Subsets(shard, sizes, place.split(shard.lengths().tolist())[shard.rank].to(shard.rows.device))
 
     def take(self, size: int) -> Shard:
         """Return the rows of this process in the subset of so many rows."""

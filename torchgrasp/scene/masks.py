@@ -107,8 +107,7 @@ def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Te
             raise ValueError(f"size {size}, sum {runs.sum()}")
     except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise BadArgument(name, f"{type(error).__name__} ({error}) in run lengths", allowed) from error
-    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-    return torch.from_numpy(flat.reshape(shape[::-1]).T.copy())
+    return torch.from_numpy(np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(shape[::-1]).T.copy())
 
 
 def _run_lengths(text: bytes) -> list[int]:

@@ -144,8 +144,7 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
 
     def mirrored(size: float) -> Float[Tensor, "n"]:
         middle = axes @ torch.stack([front - size / 2, (low[1] + high[1]) / 2])
-        image = torch.cat([2 * middle - points[:, :2], points[:, 2:]], -1)
-        return shadows.look(image)[0]
+        return shadows.look(torch.cat([2 * middle - points[:, :2], points[:, 2:]], -1))[0]
 
     behind, _ = shadows.look(points)
     under = top[column(points[:, :2].double())] - points[:, 2]

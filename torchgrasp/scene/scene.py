@@ -249,8 +249,7 @@ class Scene(Value):
         image, rows = self.image, self.pixels[self.labels == 0]
         on_table = torch.zeros(image.depth.shape, dtype=torch.bool)
         on_table[rows[:, 0], rows[:, 1]] = True
-        in_camera = self.table.moved(inverse(image.obj_from_camera))
-        return estimate_noise(image.depth, image.intrinsics, in_camera, on_table)
+        return estimate_noise(image.depth, image.intrinsics, self.table.moved(inverse(image.obj_from_camera)), on_table)
 
     @property
     def viewpoint(self) -> Float[Tensor, "3"]:

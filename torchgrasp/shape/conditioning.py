@@ -169,5 +169,4 @@ def _extend(
     order = torch.cat([posterior.ordered(row[0]), row[1] if new_order is None else row[1][new_order]])
     solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
     weights = solved[torch.argsort(order)]
-    x = torch.cat([posterior.x, new.x])[points]
-    return Posterior(x, has[points], weights, factor, order, posterior.kernel)
+    return Posterior(torch.cat([posterior.x, new.x])[points], has[points], weights, factor, order, posterior.kernel)

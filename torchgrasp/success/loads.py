@@ -69,8 +69,7 @@ def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -
     hand_from_obj = inverse(grasps.obj_from_hand.to(joints))
     jacobian = hand.jacobian(joints, apply(hand_from_obj, grasps.contacts.points.to(joints)))
     torque = torch.einsum("gfih,gfi->gh", jacobian, rotate(hand_from_obj, forces.to(joints)))
-    effort = torque.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
-    return (effort / torque.abs()).amin(1)
+    return (torque.new_tensor([hand.actuators[name].effort for name in hand.joint_names]) / torque.abs()).amin(1)
 
 
 def log_odds_about(

@@ -90,8 +90,7 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
         xyz, rpy = place(pose @ pose_of(shape))
         shapes.append(dataclasses.replace(shape, xyz=xyz, rpy=rpy))
     x, y, z = (turn @ link.com + pose[:3, 3]).tolist()
-    inertia = _triangle(turn @ _matrix(link.inertia) @ turn.T)
-    return Link(link.name, link.mass, (x, y, z), inertia, tuple(shapes))
+    return Link(link.name, link.mass, (x, y, z), _triangle(turn @ _matrix(link.inertia) @ turn.T), tuple(shapes))
 
 
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
@@ -171,8 +170,7 @@ def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
         ends = sorted((end - mimic.offset) / mimic.ratio for end in (j.lower, j.upper))
         low, high = max(leader.lower, ends[0]), min(leader.upper, ends[1])
         if not low < high:
-            found = f"joint {name} that follows {leader.name} outside its own limits"
-            raise urdf.wrong(found, "limits that overlap")
+            raise urdf.wrong(f"joint {name} that follows {leader.name} outside its own limits", "limits that overlap")
         if (low, high) != (leader.lower, leader.upper):
             joints[leader.name] = dataclasses.replace(leader, lower=low, upper=high)
             done.append(
