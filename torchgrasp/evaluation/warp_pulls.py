@@ -15,6 +15,8 @@ from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
 from torchgrasp.geometry.frames import rotation_angle
 from torchgrasp.sim.warp_scene import WarpScenes
 
+BATCH = 1024  # trials that are simulated at once, which bounds the memory
+
 
 @checked
 def pull_grasps(
@@ -23,14 +25,16 @@ def pull_grasps(
     """Close one hand on many objects and pull each along the world's axes, as `pull_grasp` in MuJoCo, all at once.
 
     The closing must be "open_loop", which needs no sensor. All six pulls of a trial begin from the same closed hand.
-    `device` is Warp's: "cuda" or "cpu". `PullResult.force` is NaN; `seconds` is a trial's share of the time.
+    `device` is Warp's: "cuda" or "cpu". `PullResult.force` is NaN; `seconds` is a trial's share of the wall time. On a
+    GPU the order of sums changes from run to run, and with it the last digits of the motion.
 
     Raises:
-        BadArgument: no trial, trials of several hands, or a protocol that this cannot run.
+        BadArgument: no trial, more than one `Hand`, an unknown device, or a protocol that this cannot run.
         MissingExtra: MuJoCo Warp is not installed; otherwise as `pull_grasp`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> from torchgrasp.evaluation import Truth
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
     >>> trial = GraspTrial(load_hand("allegro"), grasp, Truth(jug.mesh, jug.parts))
     >>> pull_grasps([trial] * 1000)[0].passed  # doctest: +SKIP
@@ -41,7 +45,10 @@ def pull_grasps(
         raise BadArgument("protocol", repr(protocol.name), "one that closes in open loop, without approach, and pulls")
     if len({id(trial.hand) for trial in trials}) != 1:
         raise BadArgument("trials", f"{len({id(trial.hand) for trial in trials})} hands", "trials of one hand")
-    return pull_drivers([TrialDriver(trial, protocol.trial) for trial in trials], protocol.pull, device)
+    drivers, results = [TrialDriver(trial, protocol.trial) for trial in trials], list[PullResult]()
+    for first in range(0, len(drivers), BATCH):
+        results += pull_drivers(drivers[first : first + BATCH], protocol.pull, device)
+    return results
 
 
 def pull_drivers(drivers: Sequence[TrialDriver], spec: PullSpec, device: str) -> list[PullResult]:
