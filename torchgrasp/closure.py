@@ -166,9 +166,8 @@ class ClosingOptions(Value):
         attempts: largest number of closings: on a known table the hand closes again if the grasp seems too weak to
             lift.
 
-    Raises:
-        BadArgument: a number outside its range; `palm_reach` or a second attempt without `pose_estimate`; `stops`
-            with a `palm_reach` of 0.
+    Raises `BadArgument` for a number outside its range, for `palm_reach` or a second attempt without `pose_estimate`,
+    or for `stops` with a `palm_reach` of 0.
 
     >>> ClosingOptions(palm_reach=0.0, stops=0).attempts  # an arm that cannot yield
     5

@@ -35,10 +35,8 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     * `jacobian`: the Jacobian of the fingertips equals central differences.
     * `batch`: the rows of a batch equal single postures, and an empty batch is empty.
 
-    Raises:
-        HandFileError: a file breaks a rule; the message names the file, what was found and what is allowed.
-        BadArgument: the hand has no such fingers.
-        BrokenLaw: the kinematics break a law; the error names the first.
+    Raises `BrokenLaw` for the first law that the kinematics break, `HandFileError` for a file that breaks a rule, and
+    `BadArgument` if the hand has no such fingers.
 
     >>> check_hand("barrett").name
     'barrett'

@@ -58,9 +58,8 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
         force: normal force of the strongest finger [N].
         kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
 
-    Raises:
-        BadArgument: joints or fingers of another hand, a force or stiffness that is not positive, contacts or poses by
-            which derivatives are taken.
+    Raises `BadArgument` for joints or fingers of another hand, a force or stiffness that is not positive, contacts or
+    poses by which derivatives are taken.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -94,9 +94,8 @@ class ClosingReference(Value):
             stability: model that chooses among balanced forces that need nearly equal friction, and gives the
                 covariance of the forces; without it the covariance grows with the force.
 
-        Raises:
-            BadArgument: not exactly one grasp, joints or fingers of another hand, a force or stiffness that is not
-                positive, joints beyond their limits, or numbers in the grasp that are not finite.
+        Raises `BadArgument` for not exactly one grasp, joints or fingers of another hand, a force or stiffness that is
+        not positive, joints beyond their limits, or numbers in the grasp that are not finite.
         """
         check_single(grasp)
         forces.check_hand(hand, grasp)

@@ -151,7 +151,11 @@ class FingertipSensor:
         """
         reference, before = self.reference, self.sensed
         if self.model.kind == "torque":
-            self.sensed = feel_torques(before, reference, jacobian, self._torques(truth, jacobian), period)
+            torques = torch.einsum("fcj,fc->j", jacobian, truth.forces)
+            if self.generator is not None:
+                drawn = torch.randn(len(torques), generator=self.generator, dtype=torques.dtype)
+                torques = torques + self.model.noise * TORQUE_NOISE * drawn
+            self.sensed = feel_torques(before, reference, jacobian, torques, period)
         else:
             radius, noise = reference.hand.tips.radius, self.model.noise
             self.sensed = measure(before, truth, reference.normals, radius, period, self.generator, noise)
@@ -167,11 +171,3 @@ class FingertipSensor:
         if self.sensed.reading is not before.reading:  # a sample is held until the next one
             self.reports = [*self.reports, report][-late - 1 :]
         return self.reports[0]
-
-    def _torques(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"]) -> Float[Tensor, " j"]:
-        """Return the torques [N m] that the true contacts cause at all joints, with the noise of the torque sensors."""
-        torques = torch.einsum("fcj,fc->j", jacobian, truth.forces)
-        if self.generator is not None:
-            drawn = torch.randn(len(torques), generator=self.generator, dtype=torques.dtype)
-            torques = torques + self.model.noise * TORQUE_NOISE * drawn
-        return torques

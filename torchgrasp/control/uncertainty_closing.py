@@ -85,7 +85,9 @@ class UncertaintyClosing:
             contact = self.touched
         error = error + ahead.clamp_max(0.0)[:, None] * normals
         share = torch.where(contact | rests, 1.0, blend(error, gains.covariance))
-        self._count(observation, contact, share, period)
+        self.share, self.waiting = share, self.waiting + period if bool(contact.any()) else 0.0
+        touching = observation.tactile.contact | (contact & ~self.alive)
+        self.settled.update(observation, touching, share, period, pressing=not self.waits)
         desired = self._desired(reading, contact, rests)
         force_error = -(desired - reading)[:, None] * normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain)
@@ -154,15 +156,6 @@ class UncertaintyClosing:
             rest = WAITING_FORCE if bool(contact.all()) else reading.clamp_max(WAITING_FORCE)
             desired = torch.where(contact, rest, desired)
         return torch.where(~self.alive & (contact | rests), reading, desired)
-
-    def _count(
-        self, observation: Observation, touched: Bool[Tensor, "f"], share: Float[Tensor, "f"], period: float
-    ) -> None:
-        """Update the time since the first touch, and the time for which all fingers have been settled."""
-        self.share = share
-        self.waiting = self.waiting + period if bool(touched.any()) else 0.0
-        touching = observation.tactile.contact | (touched & ~self.alive)
-        self.settled.update(observation, touching, share, period, pressing=not self.waits)
 
 
 def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:

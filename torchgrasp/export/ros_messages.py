@@ -45,11 +45,9 @@ def format_moveit(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     pre-grasp posture has positions; the grasp posture closes to the contacts, then to targets that press, with the
     torques [N m] as effort. `grasp_quality` is the predicted success. The retreat is opposite to the approach. `force`
     [N] is the normal force of the strongest finger. `kp` is the stiffness of the robot's own position control [N
-    m/rad], by default the hand's.
-
-    Raises:
-        BadArgument: joints of another hand, or a force or stiffness that is not positive; a grasp whose hand goes down
-            while it closes (`opened_pose`), which a message with one pose cannot tell.
+    m/rad], by default the hand's. Raises `BadArgument` for joints of another hand, a force or stiffness that is not
+    positive, or a grasp whose hand goes down while it closes (`opened_pose`), which a message with one pose cannot
+    tell.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -116,11 +116,9 @@ def write_samples(
     """Draw random postures of a hand as `sample_configurations` does, and write them to a folder, chunk by chunk.
 
     The same call continues an interrupted run. `workers` threads draw at the same time. The observer is called with the
-    number of postures on disk at the start, then with the number of postures in each new chunk.
-
-    Raises:
-        BadArgument: workers outside [1, 1024], or a hand of which almost all postures collide.
-        OutputError: the folder holds other samples, another run is writing it, or the disk is full.
+    number of postures on disk at the start, then with the number of postures in each new chunk. Raises `BadArgument`
+    for workers outside [1, 1024], or a hand of which almost all postures collide, and `OutputError` if the folder holds
+    other samples, another run is writing it, or the disk is full.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand

@@ -37,11 +37,9 @@ class of_parameters(kept[Kept]):
 class GaussianMixture(Value):
     """A mixture of m Gaussians over d named dimensions (Eqs. 19-20), evaluated in float64.
 
-    Densities are differentiable, to any order, in the points and in `weights`, `means` and `covariances`.
-
-    Raises:
-        BadArgument: inconsistent shapes, weights that are negative or do not sum to 1, an indefinite or asymmetric
-            covariance, a repeated name.
+    Densities are differentiable, to any order, in the points and in `weights`, `means` and `covariances`. Raises
+    `BadArgument` for inconsistent shapes, weights that are negative or do not sum to 1, an indefinite or asymmetric
+    covariance, or a repeated name.
 
     >>> mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
     >>> mixture.condition({"b": 3.0}).means

@@ -216,18 +216,14 @@ def free_space_violations(shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[
 
 
 def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 3"]:
-    """Return points [m] on camera rays 8 and 16 mm outside the outline, over the object's depth."""
-    depth = float(outline.depth[outline.depth > 0].median())  # 0 beyond the image
-    rays = [_rays_beside(outline, offset / depth) for offset in (0.008, 0.016)]
+    """Return points [m] on camera rays, 32 each 8 and 16 mm outside the outline, over the object's depth."""
+    depth, rays = float(outline.depth[outline.depth > 0].median()), []  # the depth is 0 beyond the image
+    for offset in (0.008, 0.016):
+        near = (outline.outside - offset / depth).abs() <= 0.75 * outline.cell
+        row, column = torch.nonzero(near, as_tuple=True)
+        position = outline.corner + outline.cell * torch.stack([column, row], -1).double()
+        beside = torch.cat([position, torch.ones_like(position[:, :1])], -1)  # at depth 1 in the camera's frame
+        rays.append(beside[farthest_points(beside, 32, tie=TIE)])
     middle = float((origin - outline.viewpoint) @ outline.axes[2])
     depths = middle + scale * torch.linspace(-1.0, 1.0, 13, dtype=torch.float64, device="cpu")
     return (torch.cat(rays)[:, None] * depths[:, None]).reshape(-1, 3) @ outline.axes + outline.viewpoint
-
-
-def _rays_beside(outline: Silhouette, offset: float) -> Float[Tensor, "k 3"]:
-    """Return 32 camera rays outside the outline by `offset` at depth 1, as points at depth 1 in the camera's frame."""
-    near = (outline.outside - offset).abs() <= 0.75 * outline.cell
-    row, column = torch.nonzero(near, as_tuple=True)
-    position = outline.corner + outline.cell * torch.stack([column, row], -1).double()
-    rays = torch.cat([position, torch.ones_like(position[:, :1])], -1)
-    return rays[farthest_points(rays, 32, tie=TIE)]

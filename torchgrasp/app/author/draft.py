@@ -86,9 +86,7 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
 def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = "hand.urdf") -> Draft:  # noqa: B008
     """Repair a published URDF, and draft a hand.toml for the clean copy, which the user saves as `file`.
 
-    Raises:
-        HandFileError: the URDF or one of its meshes is missing, malformed or hostile, or cannot be repaired.
-        BadArgument: fewer than three tips, more than five, or a tip without a collision shape or a movable joint.
+    Raises the errors of `draft_hand`, and `HandFileError` for a hostile mesh, or a URDF that cannot be repaired.
 
     >>> from torchgrasp import load_hand
     >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))

@@ -142,7 +142,10 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, 
             planes += list(_best_plane(scorer, _plane_grid(scorer, AXIS, FINE_OFFSETS)[0], END_SCORE))
     else:
         best = _refine(scorer, grid[strongest, int(scores[strongest].argmax())])
-        planes = _without_slope(scorer, planes, best)
+        # Some planes score well only because they are near the best plane.
+        least = float(scorer.score(best[None])[0]) - SLOPE
+        apart = [abs(float(plane[:3] @ best[:3])) < APART for plane in planes]
+        planes = [p for p, far in zip(planes, apart, strict=True) if far or float(scorer.score(p[None])[0]) > least]
         planes += list(_square_plane(scorer, planes, best, across))
         half = ((scorer.points[:, 2].max() + scorer.table.offset) / 2)[None, None]
         planes += list(_best_plane(scorer, torch.cat([AXIS, half], 1), 0.0))
@@ -220,12 +223,6 @@ def _hides(directions: Directions, across: View) -> Bool[Tensor, "d"]:
     if across is None:
         return torch.ones(len(directions), dtype=torch.bool, device="cpu")
     return (directions @ across).abs() > MIN_FACING
-
-
-def _without_slope(scorer: SymmetryScorer, planes: list[Mirror], best: Mirror) -> list[Mirror]:
-    """Return the planes without those that score well only because they are near the best plane."""
-    least = float(scorer.score(best[None])[0]) - SLOPE
-    return [p for p in planes if abs(float(p[:3] @ best[:3])) < APART or float(scorer.score(p[None])[0]) > least]
 
 
 def _across_plane(scorer: SymmetryScorer, planes: list[Mirror], grid: Float[Tensor, "d k 4"], across: View) -> Mirrors:
