@@ -129,6 +129,9 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     by_object = {name: _shares([score for score in scores if score.object == name]) for name in names}
     groups = sorted({score.group for score in scores if score.group})
     most = max((attempt.tries for attempt in attempts), default=1)
+    known = [(score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)]
+    predicted = torch.tensor([attempt.predicted for _, attempt in known], dtype=torch.float64)
+    passed = torch.tensor([attempt.passed for _, attempt in known], dtype=torch.bool)
     reasons_of = {"planning": Counter(s.refusal.name for s in scores if s.refusal is not Status.OK)}
     for stage, reasons in STAGES.items():
         reasons_of[stage] = Counter(a.status.name for a in attempts if not a.passed and a.status in reasons)
@@ -146,7 +149,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "plan_cpu_s": _mean(score.seconds for score in scores),
         "trial_cpu_s": _mean(a.seconds for a in attempts),
         "cpu_s": sum(x for x in spent if not math.isnan(x)),
-        "success": _judge_predictions(scores),
+        "success": judge(predicted, passed, [unit for unit, _ in known]) if known else None,
         "by_object": by_object,
         "by_group": {name: _shares([score for score in scores if score.group == name]) for name in groups},
     }
@@ -178,15 +181,6 @@ def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
         "refused": len(refused),
         "executable": sum(score.executable for score in scores),
     }
-
-
-def _judge_predictions(scores: Sequence[ViewScore]) -> dict[str, Any] | None:
-    """Return how well predicted success agrees with the outcomes of trials; None if no attempt has a prediction."""
-    known = [(score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)]
-    if not known:
-        return None
-    predicted = torch.tensor([attempt.predicted for _, attempt in known], dtype=torch.float64)
-    return judge(predicted, torch.tensor([attempt.passed for _, attempt in known]), [unit for unit, _ in known])
 
 
 def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:

@@ -25,8 +25,6 @@ POINTS, DIRECTIONS, POSES = (
     ("obj_from_hand", "obj_from_vf"),
 )
 """Names of the fields that change with the coordinate frame, by kind; all other fields are invariant."""
-
-
 LEAST_TILT = 0.05  # least sine of the angle between the vertical and a camera that has an azimuth
 
 

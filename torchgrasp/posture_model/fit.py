@@ -184,12 +184,7 @@ def standardised_rows(
     if n < least:
         raise BadArgument("samples", f"{n} samples", f"at least {least}")
     check_whole("components", components, 1, n // least)
-    return shard, *_standardise(shard, (*samples.joint_names, *CODE_NAMES))
-
-
-def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
-    """Scale every data column to mean 0 and variance 1 in place; return the original means and standard deviations."""
-    x, n = shard.rows, shard.count()
+    x, names = shard.rows, (*samples.joint_names, *CODE_NAMES)
     centre = shard.sum(x.sum(0)) / n
     x.sub_(centre)
     scale = (shard.sum(x.square().sum(0)) / n).sqrt()
@@ -198,7 +193,7 @@ def _standardise(shard: Shard, names: tuple[str, ...]) -> tuple[Float[Tensor, "d
         found = ", ".join(name for name, c in zip(names, constant, strict=True) if c)
         raise BadArgument("samples", f"no variation in {found}", "samples that vary in every dimension")
     x.div_(scale)
-    return centre, scale
+    return shard, centre, scale
 
 
 def _likeliest(shard: Shard, starts: list[Progress], regularisation: float) -> Progress:

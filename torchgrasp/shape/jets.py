@@ -22,8 +22,7 @@ class Weighted(NamedTuple):
     kernel: Kernel
 
 
-Explain = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""`Posterior.explain`, for the points of a chunk."""
+Explain = Callable[[Tensor], tuple[Tensor, Tensor]]  # `Posterior.explain`, for the points of a chunk
 Values = Float[Tensor, "q n"]
 Kernels = tuple[list[Tensor], Values, Values, Float[Tensor, "q near"]]
 """Components of the differences from the observed points, k, k', and k'' for the points with normals."""

@@ -27,11 +27,9 @@ CAUSES: dict[str, dict[str, str]] = {
 }
 """The features with their units, by what they tell about."""
 
-FEATURES = tuple(name for names in CAUSES.values() for name in names)
-"""All features, in the order of the columns."""
+FEATURES = tuple(name for names in CAUSES.values() for name in names)  # all features, in the order of the columns
 
-GRIP = 15.0
-"""Greatest force [N] that a hand which grips as the load asks for may need."""
+GRIP = 15.0  # greatest force [N] that a hand which grips as the load asks for may need
 
 
 def measure_grasps(

@@ -13,8 +13,7 @@ from torchgrasp.plan.closure import cone_edges, tangents
 from torchgrasp.plan.forces import grasp_map, least_friction_forces
 from torchgrasp.values import Contacts, Grasps
 
-CARRYING = 2.07
-"""Log-odds of success that a lift loses for each factor e on the force that carries the load."""
+CARRYING = 2.07  # log-odds of success that a lift loses for each factor e on the force that carries the load
 
 
 def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> Float[Tensor, "b"]:

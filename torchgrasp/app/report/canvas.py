@@ -12,10 +12,8 @@ Points = Float[np.ndarray, "n 3"]
 Color = tuple[float, float, float]
 Direction = tuple[float, float, float]
 
-FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")
-"""Colours of the fingers, in grasp order."""
-AXES = ("#d62728", "#2ca02c", "#1f4fd8")
-"""Colours of x, y and z of a frame."""
+FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")  # colours of the fingers, in grasp order
+AXES = ("#d62728", "#2ca02c", "#1f4fd8")  # colours of x, y and z of a frame
 HAND, OBJECT, TABLE = "#a9b0ba", "#e9d7b3", "#eceae4"
 """Colours of the palm with parked fingers, of the object, and of the table."""
 OBJECTS = ("#e8743b", "#3f83d9", "#57a84f", "#b65fae", "#e0b92f", "#35aaa3", "#dd6b78", "#8474c9")
