@@ -15,8 +15,8 @@ from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.plan.certify import certify
-from torchgrasp.planner.batches import FIRST, schedule
 from torchgrasp.planner.contacts import LIKELY, Pool, SeededContacts
+from torchgrasp.planner.schedule import FIRST, schedule
 from torchgrasp.values import Certificate, Contacts, IKSeeds
 
 SPEC = ContactSpec(table=0.0)

@@ -7,7 +7,7 @@ from tests.make import cup_view, load_hand, same_bits
 from torchgrasp import ContactSpec, GraspTask, PointCloud, Status, load_object, plan_grasps
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, move
-from torchgrasp.planner.many import plan_stack
+from torchgrasp.planner.many import estimate_shapes, plan_stacks
 from torchgrasp.planner.request import Request
 
 HAND = load_hand("barrett")
@@ -54,12 +54,12 @@ def test_what_no_row_can_have_is_refused_before_any_work():
         plan_grasps(VIEWS[0], HAND, workers=2)
 
 
-@pytest.mark.parametrize("fingers", ["barrett", "allegro", 4])
-def test_clouds_that_are_planned_at_once_have_the_grasps_of_each_alone(fingers):
+@pytest.mark.parametrize(("fingers", "workers"), [("barrett", 2), ("allegro", 0), (4, 0)])
+def test_clouds_that_are_planned_at_once_have_the_grasps_of_each_alone(fingers, workers):
     hand = load_hand("allegro", fingers) if fingers == 4 else load_hand(fingers)
     clouds, spec, task = [load_object("jug").view, SMALL, cup_view(0.004)], ContactSpec(table=0.0), GraspTask(0.1)
     requests = [Request(cloud, hand, spec, 12, task=task) for cloud in clouds]
-    together = plan_stack(requests, torch.device("cpu"))
+    together = list(plan_stacks(requests, estimate_shapes(requests, workers), torch.device("cpu")))
     assert "refused" in together[1].meta
     for found, cloud in zip(together[::2], clouds[::2], strict=True):
         alone = plan_grasps(cloud, hand, spec, 12, task=task)

@@ -125,9 +125,10 @@ class LeastSquares(Problem[State, LinearResiduals]):
         # Relative damping alone would leave a joint that moves nothing undamped.
         factor, info = torch.linalg.cholesky_ex(normal + torch.diag_embed(damping[:, None] * diagonal + 1e-3))
         x = -torch.cholesky_solve(model.jacobian.mT @ model.residual[..., None], factor)[..., 0]
-        x = torch.where((info == 0)[:, None], x, 0.0)
-        x = x * (self.largest / x.abs().amax(1, keepdim=True).clamp_min(self.largest))
-        return x, ~(model.cost < self.solved) & torch.isfinite(damping)
+        taken = ~(model.cost < self.solved) & torch.isfinite(damping)
+        # A GPU may factor a matrix with an infinite diagonal without complaint; its step is NaN.
+        x = torch.where(((info == 0) & taken)[:, None], x, 0.0)
+        return x * (self.largest / x.abs().amax(1, keepdim=True).clamp_min(self.largest)), taken
 
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
         """Return the states of the problems after the steps `x`."""

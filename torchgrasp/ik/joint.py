@@ -161,7 +161,7 @@ def solve_sliding(
     """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps to `attempts`."""
     count = 8 if len(problem.hand.tips) == 3 else 2
     chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, count)
-    size = at_once(chosen.row, 512)
+    size = min(at_once(chosen.row, 512), 2**15)  # the Jacobians of more do not fit into an accelerator
     for part in (chosen[k : k + size] for k in range(0, len(chosen), size)):
         own = joint_problem.rows(part.row)
         points = own.shape.normalise(assign(problem.contacts, part).points)

@@ -60,10 +60,9 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec
-    points, normals = (x.double().cpu() for x in (check_contacts(contacts).points, contacts.normals))
+    points, normals = (x.double() for x in (check_contacts(contacts).points, contacts.normals))
     wrench = wrenches(points, check_unit(normals), spec.planned_friction, spec.edges)
-    proof = _Proof.apply(wrench.flatten(1, 2), degenerate(points))
-    return Certificate(*(t.to(contacts.points.device) for t in proof[:5]))
+    return Certificate(*_Proof.apply(wrench.flatten(1, 2), degenerate(points))[:5])
 
 
 class _Proof(torch.autograd.Function):
@@ -152,7 +151,7 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
     margin, residual = torch.where(unbalanced, -torch.inf, margin), torch.where(unbalanced, torch.inf, residual)
     proven = (residual <= EXACT) & (upper - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
     for row in torch.nonzero(~(proven | unbalanced))[:, 0].tolist():
-        margin[row], residual[row], dual, phi[row] = solve_by_highs(wrench[row].numpy())
+        margin[row], residual[row], dual, phi[row] = solve_by_highs(wrench[row].cpu().numpy())
         witness[row] = witness[row] if dual is None else torch.from_numpy(dual)
     product = (wrench @ witness[..., None])[..., 0]
     dual = witness / (product - product.amin(-1, keepdim=True)).sum(-1, keepdim=True)

@@ -18,6 +18,7 @@ from torchgrasp.ik.refine import ITERATIONS
 from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.report import Report
+from torchgrasp.planner.schedule import OFFERED
 from torchgrasp.planner.stack import Owner, Stack, by_cloud
 from torchgrasp.specs import Ranking
 from torchgrasp.success.features import measure_grasps
@@ -25,33 +26,8 @@ from torchgrasp.success.model import load_model
 from torchgrasp.success.order import by_success, is_known, keep_promise, rank_by_success, rank_by_variance
 from torchgrasp.values import ContactPlan, Grasps
 
-FIRST, GROWTH = 8, 6
-"""Number of contact sets that the hand tries in the first batch, and ratio of the sizes of successive batches."""
 FIRST_STEPS = 8
 """Most steps of the solver in the first batch; the second batch tries unsolved contact sets with all steps."""
-TRIED, TRIED_IN_SCENE = 250, 160
-"""Most contact sets that the hand tries: fewer in a scene, because there it tries more postures for each set."""
-OFFERED = 4  # planned rows for each row that the hand tries
-
-
-class Batch(NamedTuple):
-    """The size of one batch: the number of new initial guesses, and of contact sets that the hand tries."""
-
-    starts: int
-    tried: int
-
-
-def schedule(starts: int, most: int) -> list[Batch]:
-    """Return batches with `starts` guesses and `most` contact sets in all; a small remainder joins the last batch."""
-    batches, size, most = list[Batch](), FIRST, min(most, starts)
-    tried = planned = 0
-    while tried < most:
-        size = size if most - tried >= 2 * size else most - tried
-        tried += size
-        further = min(starts, max(OFFERED * tried, starts * tried // most)) - planned
-        batches.append(Batch(further, size))
-        planned, size = planned + further, GROWTH * size
-    return batches
 
 
 def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
@@ -67,6 +43,8 @@ def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
 
 def plan_hands(problems: Sequence[Problem], deadline: float, device: torch.device) -> list[list[Grasps]]:
     """Return for each problem the batches that `plan_hand` yields; all problems are solved together on a device."""
+    if not problems:
+        return []
     batches = zip(*Planner(Stack.of(problems, device)).run(deadline), strict=True)
     return [list(_relax(problem, iter(own), deadline)) for problem, own in zip(problems, batches, strict=True)]
 
@@ -87,7 +65,7 @@ def _relax(problem: Problem, batches: Iterator[Grasps], deadline: float) -> Iter
         spec = None if best > 0.5 or problem.buried or time.monotonic() >= deadline else next(relaxed, None)
         if spec is None:
             break
-        problem = problem.replace("flat", given_spec=spec, descends=True)  # nothing else depends on these
+        problem = problem.replace("flat", "drawn", given_spec=spec, descends=True)  # nothing else depends on these
         batches = (grasps for (grasps,) in Planner(Stack.of([problem])).run(deadline))
     yield from failed
 
@@ -132,11 +110,9 @@ class Planner:
         `time.monotonic`.
         """
         stack, problem, request = self.stack, self.stack.first, self.stack.first.request
-        most = TRIED if problem.scene is None else TRIED_IN_SCENE
-        batches = schedule(request.starts, most) if request.mode == "joint" else [Batch(request.starts, most)]
-        sizes = [batch.starts for batch in batches if batch.starts]
-        plans, planned = stack.plans(sizes), 0
-        report = Report(problem, len(batches), len(sizes))
+        batches = problem.batches
+        plans, planned = stack.plans(), 0
+        report = Report(problem, len(batches), sum(batch.starts > 0 for batch in batches))
         report.shape()
         waiting = list[Owned]()
         for number, batch in enumerate(batches, start=1):

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.base import join
@@ -113,8 +113,8 @@ class Pool:
     """A store of the contact sets of all batches so far; each set is taken from it at most once."""
 
     def __init__(self, clouds: int) -> None:
-        self.taken = [list[Tensor]() for _ in range(clouds)]
-        self.parts, self.costs = list[SeededContacts](), list[Tensor]()
+        self.clouds = clouds
+        self.parts, self.costs, self.taken = list[SeededContacts](), list[Tensor](), list[Tensor]()
 
     def add(self, found: SeededContacts, cost: Float[Tensor, "n"]) -> None:
         """Add contact sets with their costs; the cost is infinite for a set without initial hand postures (seeds)."""
@@ -124,24 +124,57 @@ class Pool:
     def take(self, most: int) -> SeededContacts:
         """Return at most `most` of each cloud's cheapest contact sets, far from each other and from earlier ones."""
         found = join_seeded(self.parts)
-        clouds = by_cloud(found.owner, len(self.taken))
-        points, costs = sorted_points(found.contacts), torch.cat(self.costs)
-        if len(clouds) > 1:  # the choice runs on the host
-            points, costs = points.cpu(), costs.cpu()
-        rows = [
-            own[_choose(points[own], costs[own], taken, most)] for own, taken in zip(clouds, self.taken, strict=True)
-        ]
-        return found.select(torch.cat(rows).to(found.owner.device))
+        points, owner = sorted_points(found.contacts), found.owner
+        before = torch.cat(self.taken) if self.taken else owner[:0]
+        cost = torch.cat(self.costs).index_fill(0, before, torch.inf)
+        if self.clouds > 1:
+            rows = _choose_of_each(points, cost, owner, before, most, self.clouds)
+        else:
+            likely = torch.argsort(cost, stable=True)[: min(LIKELY * most, int(torch.isfinite(cost).sum()))]
+            rows = likely[farthest_points(points[likely], most, before=points[before])].sort().values
+        self.taken.append(rows)
+        return found.select(rows)
 
 
-def _choose(points: Float[Tensor, "n d"], cost: Float[Tensor, "n"], taken: list[Tensor], most: int) -> Int[Tensor, "k"]:
-    """Return at most `most` of the cheapest contact sets of one cloud; add them to those `taken` before."""
-    before = torch.cat(taken) if taken else points.new_zeros(0, dtype=torch.long)
-    cost = cost.index_fill(0, before, torch.inf)
-    likely = torch.argsort(cost, stable=True)[: min(LIKELY * most, int(torch.isfinite(cost).sum()))]
-    rows = likely[farthest_points(points[likely], most, before=points[before])].sort().values
-    taken.append(rows)
-    return rows
+def _choose_of_each(
+    points: Float[Tensor, "n d"],
+    cost: Float[Tensor, "n"],
+    owner: Owner,
+    before: Int[Tensor, "t"],
+    most: int,
+    clouds: int,
+) -> Int[Tensor, "k"]:
+    """Return for each of several clouds at most `most` of its cheapest contact sets, far from each other and `before`.
+
+    Farthest-point sampling runs for all clouds at once, on their device.
+    """
+    table, held = _table(owner, clouds)
+    least, order = torch.where(held, cost[table], torch.inf).sort(dim=1, stable=True)
+    rows, likely = table.gather(1, order)[:, : LIKELY * most], torch.isfinite(least[:, : LIKELY * most])
+    x = points[rows]
+    nearest = torch.full_like(likely, torch.inf, dtype=x.dtype)
+    if len(before):
+        earlier, held = _table(owner[before], clouds)
+        gaps = (x[:, :, None] - points[before[earlier]][:, None]).square().sum(-1)
+        nearest = torch.where(held[:, None], gaps, torch.inf).amin(2)
+    picks = list[Tensor]()
+    for _ in range(min(most, rows.shape[1])):
+        picks.append(torch.where(likely, nearest, -1.0).argmax(1, keepdim=True))  # the first of the largest
+        one = x.gather(1, picks[-1][..., None].expand(-1, -1, x.shape[2]))
+        nearest = torch.minimum(nearest, (x - one).square().sum(-1))
+    chosen = rows.gather(1, torch.cat(picks, 1))
+    known = torch.arange(chosen.shape[1], device=rows.device) < likely.sum(1, keepdim=True)
+    chosen = torch.where(known, chosen, len(owner)).sort(1).values.flatten()
+    return chosen[torch.nonzero(chosen < len(owner))[:, 0]]
+
+
+def _table(owner: Owner, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, "c m"]]:
+    """Return the indices of the rows of each cloud, in their order, and a mask of the places that hold one."""
+    order, count = torch.argsort(owner, stable=True), torch.bincount(owner, minlength=clouds)
+    slot = torch.arange(len(owner), device=owner.device) - (count.cumsum(0) - count)[owner[order]]
+    table = owner.new_zeros(clouds, int(count.max()) if len(owner) else 0)
+    table[owner[order], slot] = order
+    return table, torch.arange(table.shape[1], device=owner.device) < count[:, None]
 
 
 def contact_costs(stack: Stack, found: SeededContacts) -> Float[Tensor, "b"]:

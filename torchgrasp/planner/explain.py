@@ -266,7 +266,7 @@ def try_request(
     for hand in hands:
         problem = problem.for_request(share, hand, postures)
         specs = list(problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max())))[-1:]
-        relaxed = (problem.replace("flat", given_spec=spec, descends=True) for spec in specs)
+        relaxed = (problem.replace("flat", "drawn", given_spec=spec, descends=True) for spec in specs)
         for tried in itertools.chain((problem,), relaxed):
             grasps = rank_together([batch for (batch,) in Planner(Stack.of([tried])).run(math.inf)], request.order)
             funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)

@@ -1,17 +1,18 @@
 """Plans of many clouds: one after another, on processes, or all at once on an accelerator."""
 
+import contextlib
 import dataclasses
+import itertools
 import math
+import pickle
 import time
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
-import numpy as np
 import torch
 
-from torchgrasp.errors import BadArgument, GraspError, MissingExtra
-from torchgrasp.files import temporary_folder
+from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
 from torchgrasp.jobs import run_tasks
@@ -19,67 +20,80 @@ from torchgrasp.planner.batches import plan_hands
 from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import finish, plan_request
-from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud, load_grasps
+from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud
+
+Result = TypeVar("Result")
 
 
 def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:
     """Plan for each cloud on its device; a bad cloud does not affect the others.
 
     `given` holds the other arguments of `Request`, common to all clouds. A worker process gives up a cloud after an
-    hour.
+    hour. Where an accelerator plans clouds at once, the worker processes estimate the shapes.
     """
     for name in ("shape", "observer", "reachable"):
         if given.get(name) is not None:
             raise BadArgument(name, "one for many clouds", "None for many clouds")
-    for cloud in clouds:
-        _ = Request(cloud, **given).hands  # wrong fingers are refused
-    if not workers:
-        planned = _plan_together([Request(cloud, **given) for cloud in clouds])
+    requests = [Request(cloud, **given) for cloud in clouds]
+    hands = [request.hands for request in requests]  # wrong fingers are refused
+    devices = {cloud.points.device for cloud in clouds}
+    together = len(devices) == 1 and devices != {torch.device("cpu")} and len(hands[0]) == 1
+    if together and requests[0].mode == "joint":
+        planned = plan_stacks(requests, estimate_shapes(requests, workers), next(iter(devices)))
     else:
-        hand = given["hand"].source
-        source = HandSource(hand.option, hand.urdf_path, hand.sha256)
-        rest = {name: _with_arrays(value) for name, value in given.items() if name != "hand"}
-        with temporary_folder() as folder:
-            files = [folder / f"{k}.safetensors" for k in range(len(clouds))]
-            sent = [(_with_arrays(cloud), str(cloud.points.device)) for cloud in clouds]
-            tasks = [(*cloud, source, rest, file) for cloud, file in zip(sent, files, strict=True)]
-            planned = [
-                load_grasps(file) if end is None else _refused(given["hand"], end.sentence)
-                for file, end in zip(files, run_tasks(_plan_to_file, tasks, workers, 3600.0), strict=True)
-            ]
+        planned = _each(_plan_or_refuse, requests, workers)
     return [grasps.to(cloud.points.device) for cloud, grasps in zip(clouds, planned, strict=True)]
 
 
-def _plan_together(requests: Sequence[Request]) -> list[Grasps]:
-    """Plan requests that differ in their clouds alone: one after another, or in stacks where an accelerator plans."""
-    most = 256  # clouds at once: with more, their rows hardly fit into the memory
-    devices = {request.cloud.points.device for request in requests if isinstance(request.cloud, PointCloud)}
-    one = len(devices) == 1 and torch.device("cpu") not in devices
-    if not one or requests[0].mode != "joint" or len(requests[0].hands) > 1:
-        return [_plan_or_refuse(request) for request in requests]
-    return [grasps for k in range(0, len(requests), most) for grasps in plan_stack(requests[k : k + most], *devices)]
+def plan_stacks(
+    requests: Sequence[Request], prepared: Iterator[Problem | Grasps], device: torch.device
+) -> Iterator[Grasps]:
+    """Yield the grasps of prepared problems, which differ in their clouds alone, planned at once on a device.
 
-
-def plan_stack(requests: Sequence[Request], device: torch.device) -> list[Grasps]:
-    """Plan requests at once on a device; shapes are estimated on the CPU.
-
-    A bad cloud gives an empty set of grasps, and does not affect the others.
+    The problems of the next stack are prepared while the device plans. A refused problem, which is an empty set of
+    grasps, stays as it is.
     """
-    found, problems = dict[int, Grasps](), dict[int, Problem]()
-    hand, budget = settle_hand(requests[0].hands[0], torch.device("cpu")), requests[0].time_budget
+    most = 128  # clouds at once: a device plans more of them hardly faster, and their rows would fill its memory
+    budget = requests[0].time_budget if requests else None
     deadline = math.inf if budget is None else time.monotonic() + budget
-    for k, request in enumerate(requests):
-        try:
-            problems[k] = Problem.of(dataclasses.replace(request, cloud=request.cloud.to("cpu")), hand).prepared()
-        except MissingExtra:
-            raise
-        except GraspError as error:
-            found[k] = _refused(request.hand, " ".join(str(error).split()))
-    if problems:
-        planned = plan_hands(list(problems.values()), deadline, device)
-        for (k, problem), batches in zip(problems.items(), planned, strict=True):
-            found[k] = finish(requests[k], [problem.give_back(grasps.to("cpu")) for grasps in batches])
-    return [found[k].to(device) for k in range(len(requests))]
+    with ThreadPoolExecutor(1) as beside:
+        ahead = beside.submit(lambda: list(itertools.islice(prepared, most)))
+        for first in range(0, len(requests), most):
+            stack, ahead = ahead.result(), beside.submit(lambda: list(itertools.islice(prepared, most)))
+            yield from _plan_stack(requests[first : first + most], stack, device, deadline)
+
+
+def estimate_shapes(requests: Sequence[Request], workers: int) -> Generator[Problem | Grasps, None, None]:
+    """Yield the planning problem of each request on the CPU, or an empty set of grasps for a bad cloud."""
+    return _each(_prepare, [dataclasses.replace(x, cloud=x.cloud.to("cpu")) for x in requests], workers)
+
+
+def _plan_stack(
+    requests: Sequence[Request], prepared: Sequence[Problem | Grasps], device: torch.device, deadline: float
+) -> Iterator[Grasps]:
+    """Yield the grasps of prepared problems that are planned at once on a device."""
+    hand = settle_hand(requests[0].hands[0], torch.device("cpu"))
+    problems = [
+        None if isinstance(x, Grasps) else x.replace(hand=hand, request=request)
+        for x, request in zip(prepared, requests, strict=True)
+    ]
+    planned = iter(plan_hands([x for x in problems if x is not None], deadline, device))
+    for one, problem in zip(prepared, problems, strict=True):
+        if problem is None:
+            assert isinstance(one, Grasps)
+            yield one
+        else:
+            yield finish(problem.request, [problem.give_back(grasps.to("cpu")) for grasps in next(planned)])
+
+
+def _prepare(request: Request) -> Problem | Grasps:
+    """Estimate the shape of a request's object and draw initial guesses; refuse a bad cloud as `_plan_or_refuse`."""
+    try:
+        return Problem.of(request, settle_hand(request.hands[0], torch.device("cpu"))).prepared()
+    except MissingExtra:
+        raise
+    except GraspError as error:
+        return _refused(request.hand, " ".join(str(error).split()))
 
 
 def _plan_or_refuse(request: Request) -> Grasps:
@@ -112,26 +126,24 @@ def no_grasps(hand: Hand) -> Grasps:
     )  # fmt: skip
 
 
-def _plan_to_file(cloud: Any, device: str, hand: HandSource, rest: dict[str, Any], file: Path) -> None:
-    """Plan for one cloud in a worker process, and save the grasps to a file."""
-    points = _with_tensors(cloud).to(torch.device(device))
-    given = {name: _with_tensors(value) for name, value in rest.items()}
-    _plan_or_refuse(Request(points, load_hand(hand.urdf_path.parent, hand.option), **given)).save(file)
+def _each(
+    function: Callable[[Request], Result], requests: Sequence[Request], workers: int
+) -> Generator[Result | Grasps, None, None]:
+    """Yield a function's results for requests with the same hand, in worker processes if there are any."""
+    if not workers:
+        yield from map(function, requests)
+        return
+    if not requests:
+        return
+    hand = requests[0].hand
+    source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)  # without the caches
+    tasks = ((function, source, pickle.dumps(dict(vars(request), hand=None))) for request in requests)
+    with contextlib.closing(run_tasks(_call, tasks, workers, 3600.0)) as results:
+        for found in results:
+            yield _refused(hand, found.sentence) if isinstance(found, Status) else pickle.loads(found)  # noqa: S301 ours
 
 
-def _with_arrays(value: Any) -> Any:
-    """Return a dataclass as a pair of its class and its fields, with tensors as NumPy arrays, for another process."""
-    if isinstance(value, torch.Tensor):
-        return value.detach().cpu().numpy()
-    if dataclasses.is_dataclass(value):
-        return type(value), {f.name: _with_arrays(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    return value
-
-
-def _with_tensors(sent: Any) -> Any:
-    """Return the value that `_with_arrays` packed, with tensors in place of the arrays."""
-    if isinstance(sent, np.ndarray):
-        return torch.from_numpy(sent)
-    if isinstance(sent, tuple) and isinstance(sent[0], type):
-        return sent[0](**{name: _with_tensors(field) for name, field in sent[1].items()})
-    return sent
+def _call(function: Callable[[Request], Any], source: HandSource, request: bytes) -> bytes:
+    """Call a function of a request in a worker process, which loads the hand itself."""
+    hand = load_hand(source.urdf_path.parent, source.option)
+    return pickle.dumps(function(Request(**dict(pickle.loads(request), hand=hand))))  # noqa: S301 our own process

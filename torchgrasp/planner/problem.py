@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -20,8 +21,9 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
-from torchgrasp.plan.starts import Settled, check_starts, settle_flatness
+from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, settle_flatness
 from torchgrasp.planner.request import Observer, Request, ignore
+from torchgrasp.planner.schedule import TRIED, TRIED_IN_SCENE, Batch, schedule
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.scene.scene import Scene
@@ -85,13 +87,13 @@ class Problem:
 
     def prepared(self) -> "Problem":
         """Return this problem after the values that stages need were computed; raise `BadArgument` as they do."""
-        _ = self.flat, self.body, self.vague
+        _ = self.drawn, self.body, self.vague
         return self
 
     def for_hand(self, hand: Hand, observer: Observer) -> "Problem":
         """Return the problem for a hand with another set of fingers, and with another observer."""
         request = dataclasses.replace(self.request, observer=observer)
-        return self.replace("flat", request=request, hand=settle_hand(hand, self.shape.device))
+        return self.replace("flat", "drawn", request=request, hand=settle_hand(hand, self.shape.device))
 
     def for_request(self, request: Request, hand: Hand, postures: int) -> "Problem":
         """Return the problem of another request on the same object and table, with a small library of `postures`."""
@@ -102,7 +104,7 @@ class Problem:
             "given_spec": spec,
             "postures": postures,
         }
-        return self.replace("flat", "obstacles", "world", "buried", "reachable", **new)
+        return self.replace("flat", "drawn", "batches", "obstacles", "world", "buried", "reachable", **new)
 
     def replace(self, *dropped: str, **changes: Any) -> "Problem":
         """Return the problem with changed fields; it keeps all derived values except those `dropped`."""
@@ -118,6 +120,22 @@ class Problem:
         tips = self.hand.tips
         spec = dataclasses.replace(spec.for_fingertips(float(tips.radius.max())), fingertips=len(tips))
         return settle_flatness(self.shape, spec, self.request.seed)
+
+    @cached_property
+    def batches(self) -> list[Batch]:
+        """The batches of the plan; only mode "joint" has more than one."""
+        most, request = TRIED if self.scene is None else TRIED_IN_SCENE, self.request
+        return schedule(request.starts, most) if request.mode == "joint" else [Batch(request.starts, most)]
+
+    def draw(self) -> Iterator[Float[Tensor, "_ f 3"]]:
+        """Yield the initial guesses of all batches, in chunks (`chunk_sizes`)."""
+        sizes = (size for batch in self.batches for size in chunk_sizes(batch.starts))
+        return drawn_starts(self.shape, self.flat, sizes, self.request.seed)
+
+    @cached_property
+    def drawn(self) -> Float[Tensor, "s f 3"]:
+        """The initial guesses of all batches."""
+        return torch.cat(list(self.draw()))
 
     @property
     def spec(self) -> ContactSpec:

@@ -1,12 +1,11 @@
 """The planning problems of several clouds as one: their objects stacked, so that all their rows are solved at once."""
 
 import dataclasses
-import itertools
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.base import join, settle
@@ -18,7 +17,7 @@ from torchgrasp.ik.joint import JointProblem
 from torchgrasp.ik.seeds import PostureLibrary
 from torchgrasp.plan.problem import ContactProblem, Shape, rows_of
 from torchgrasp.plan.solve import plan_chunk, stages_for
-from torchgrasp.plan.starts import chunk_sizes, drawn_starts
+from torchgrasp.plan.starts import chunk_sizes
 from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.success.body import EstimatedBody
@@ -50,7 +49,7 @@ class Stack:
             constraints = ContactProblem.of(first.shape, first.spec)
             return cls((first,), first.hand, first.shape, constraints, first.body, first.world)
         device = first.shape.device if device is None else device
-        shape = ShapeBatch.of([problem.shape for problem in problems]).to(device)
+        shape = ShapeBatch.of([problem.shape for problem in problems], device)
         rings = shape.scales.new_tensor([problem.spec.ring_radius for problem in problems])
         bodies = [problem.body for problem in problems]
         field = FieldBatch.of([body.field for body in bodies]).to(device)  # pyright: ignore[reportArgumentType]
@@ -79,20 +78,34 @@ class Stack:
             PostureLibrary.of(self.first.hand, self.first.postures, self.first.request.seed), self.body.center.device
         )
 
-    def plans(self, sizes: Sequence[int]) -> Iterator[tuple[ContactPlan, Owner]]:
-        """Yield one plan after another, with the cloud of each row; plan k comes from `sizes[k]` guesses a cloud."""
-        chunks, seed = [chunk_sizes(size) for size in sizes], self.first.request.seed
-        starts = [drawn_starts(p.shape, p.flat, itertools.chain(*chunks), seed) for p in self.problems]
-        stages, device = stages_for(self.first.spec), self.body.center.device
-        for parts in chunks:
-            plans, owners = list[ContactPlan](), list[Tensor]()
-            for size in parts:
-                first = torch.cat([next(drawn) for drawn in starts]).to(device)
-                owner = torch.arange(len(self), device=device).repeat_interleave(size)
-                shape, constraints = rows_of(self.shape, owner), self.constraints.rows(owner)
-                plans.append(plan_chunk(shape, constraints, first, stages))
-                owners.append(owner)
-            yield join(plans), torch.cat(owners)
+    def plans(self) -> Iterator[tuple[ContactPlan, Owner]]:
+        """Yield the plan of each batch that has new guesses, with the cloud of each row.
+
+        A single cloud is planned batch by batch. Several clouds are planned at once, before the first batch.
+        """
+        sizes = [batch.starts for batch in self.first.batches if batch.starts]
+        if len(self) == 1:
+            drawn = self.first.draw()
+            for size in sizes:
+                parts = [self._plan(next(drawn), None) for _ in chunk_sizes(size)]
+                yield join([plan for plan, _ in parts]), torch.cat([owner for _, owner in parts])
+            return
+        most = 2**17  # rows at once, whose temporaries an accelerator holds
+        first = torch.stack([problem.drawn for problem in self.problems])
+        owners = torch.arange(len(self)).repeat_interleave(first.shape[1])
+        pairs = zip(first.flatten(0, 1).split(most), owners.split(most), strict=True)
+        parts = [self._plan(*pair) for pair in pairs]
+        plan, owner = join([plan for plan, _ in parts]), torch.cat([owner for _, owner in parts])
+        index = torch.arange(len(owner), device=owner.device).view(first.shape[:2])
+        for rows in index.split(sizes, 1):
+            yield plan[rows.flatten()], owner[rows.flatten()]
+
+    def _plan(self, first: Float[Tensor, "b f 3"], owner: Tensor | None) -> tuple[ContactPlan, Owner]:
+        """Return the contact plan from initial guesses, and the cloud of each row; by default the first cloud."""
+        device = self.body.center.device
+        owner = torch.zeros(len(first), dtype=torch.long, device=device) if owner is None else owner.to(device)
+        shape, constraints = rows_of(self.shape, owner), self.constraints.rows(owner)
+        return plan_chunk(shape, constraints, first.to(device), stages_for(self.first.spec)), owner
 
     def reach(self, contacts: Contacts, certificate: Certificate, owner: Owner) -> GraspProblem:
         """Return the inverse kinematics problem of reaching contacts, with their certificate of force closure."""

@@ -43,20 +43,27 @@ class Walls(Value):
     psi: Float[Tensor, "w"]
 
     @classmethod
-    def of(cls, shapes: Sequence[ShapeGP]) -> "Walls":
-        """Stack the posteriors of shapes, each of one surface."""
+    def of(cls, shapes: Sequence[ShapeGP], device: torch.device) -> "Walls":
+        """Stack the posteriors of shapes, each of one surface, on a device, which inverts the Cholesky factors."""
         near = max(shape.n_oriented for shape in shapes)
         n = near + max(len(shape.x) - shape.n_oriented for shape in shapes)
-        sizes = (n, 3), (n,), (near, 3), (n + 3 * near, n + 3 * near)
-        x, a, b, whitener = (shapes[0].x.new_zeros(len(shapes), *size) for size in sizes)
+        x, a, b = (shapes[0].x.new_zeros(len(shapes), *size) for size in ((n, 3), (n,), (near, 3)))
+        factor = torch.eye(n + 3 * near, dtype=x.dtype, device=x.device).repeat(len(shapes), 1, 1)
+        place_of = torch.zeros(len(shapes), n + 3 * near, dtype=torch.long, device=x.device)
         for w, shape in enumerate(shapes):
             oriented = torch.arange(shape.n_oriented, device=x.device)
             place = torch.cat([oriented, near + torch.arange(len(shape.x) - len(oriented), device=x.device)])
             rows = torch.cat([place, *(n + k * near + oriented for k in range(3))])
             x[w, place], a[w, place], b[w, oriented], _ = shape.weighted
-            one = torch.eye(len(shape.weights), dtype=x.dtype, device=x.device)
-            whitener[w, rows, : len(rows)] = shape.whiten(one)
-        return cls(x, a, b, whitener, x.new_tensor([shape.psi for shape in shapes]))
+            factor[w, : len(rows), : len(rows)] = shape.factor
+            missing = torch.ones(len(place_of[w]), dtype=torch.bool, device=x.device).index_fill(0, rows, False)
+            place_of[w] = torch.cat([shape.ordered(rows), torch.nonzero(missing)[:, 0]])
+        psi, counts = (x.new_tensor(y) for y in zip(*((s.psi, len(s.factor)) for s in shapes), strict=True))
+        x, a, b, psi, factor, place_of = (y.to(device) for y in (x, a, b, psi, factor, place_of))
+        known = torch.arange(n + 3 * near, device=device) < counts.to(device)[:, None]  # no column for what is missing
+        inverse = torch.linalg.solve_triangular(factor.mT, torch.diag_embed(known.to(factor)), upper=True)
+        whitener = torch.empty_like(inverse).scatter_(1, place_of[..., None].expand_as(inverse), inverse)
+        return cls(x, a, b, whitener, psi)
 
     def weighted(self, wall: Int[Tensor, "q"]) -> Weighted:
         """Return the observations and weights of the surface of each query point."""
@@ -120,19 +127,22 @@ class ShapeBatch(Value):
     hollow: bool
 
     @classmethod
-    def of(cls, shapes: Sequence[ShapeGP]) -> "ShapeBatch":
-        """Stack shapes on one device, with one row for each; raise `BadArgument` for another kernel."""
+    def of(cls, shapes: Sequence[ShapeGP], device: torch.device | None = None) -> "ShapeBatch":
+        """Stack shapes, with one row for each, on a device, by default theirs; refuse another kernel by name."""
         for shape in shapes:
             form = shape.kernel.closed_form
             if not (isinstance(form, partial) and form.func is differentiate_thin_plate):
                 raise BadArgument("shapes", "a shape with another kernel", "thin-plate kernels")
         outer, inner = [s.walls[0] for s in shapes], [s.walls[1] for s in shapes if len(s.walls) > 1]
-        own, device = torch.arange(len(shapes), device="cpu"), shapes[0].device
+        own, device = torch.arange(len(shapes), device="cpu"), shapes[0].device if device is None else device
         second = torch.tensor([len(s.walls) > 1 for s in shapes], device="cpu")
         wall = torch.stack([own, torch.where(second, len(shapes) - 1 + second.cumsum(0), own)], 1).to(device)
         numbers = [[getattr(s, name) for s in shapes] for name in ("scale", "domain_radius", "std_factor")]
         scales, radii, factors = (torch.tensor(x, dtype=torch.float64, device=device) for x in numbers)
-        centers, surfaces = torch.stack([s.center for s in shapes]).double(), Walls.of([*outer, *inner])
+        centers, surfaces = (
+            torch.stack([s.center for s in shapes]).double().to(device),
+            Walls.of([*outer, *inner], device),
+        )
         return cls(surfaces, wall, centers, scales, radii, factors, own.to(device), bool(inner))
 
     @property

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.base import spread
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.forces import least_friction_forces
 from torchgrasp.shape.batch import ShapeBatch
@@ -90,7 +90,9 @@ def _normal_deviation(shape: ShapeGP | ShapeBatch, points: Float[Tensor, "g f 3"
     """Return the standard deviation [rad] of the surface's normal at each contact, about the axis of largest one."""
     mean, covariance = shape.estimate(shape.normalise(points).flatten(0, 1))
     normal, slope = unit(mean[:, 1:]), torch.linalg.vector_norm(mean[:, 1:], dim=-1)
-    across = torch.eye(3).to(normal) - normal[:, :, None] * normal[:, None]
-    largest = torch.linalg.eigvalsh(across @ covariance[:, 1:, 1:] @ across)[:, -1].clamp_min(0).sqrt()
+    tangents = torch.stack(across(normal), -1)
+    tangential = tangents.mT @ covariance[:, 1:, 1:] @ tangents
+    one, other = tangential.diagonal(dim1=1, dim2=2).unbind(1)
+    largest = ((one + other) / 2 + torch.hypot((one - other) / 2, tangential[:, 0, 1])).clamp_min(0).sqrt()
     largest, slope = (x.view(points.shape[:2]) for x in (largest, slope))
     return spread(shape.std_factor, largest) * largest / slope

@@ -1,7 +1,9 @@
 """Plans of many clouds at once beside plans of each alone: the same grasps, and how many of them a second."""
 
+import pickle
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import torch
@@ -10,63 +12,88 @@ from torch import Tensor
 from benchmarks.common import Options, Row, bench
 from benchmarks.gpu.launches import views
 from torchgrasp import ContactSpec, Grasps, Status, load_hand, plan_grasps
-from torchgrasp.planner.many import plan_stack
+from torchgrasp.checks import checked
+from torchgrasp.jobs import run_tasks
+from torchgrasp.planner.many import estimate_shapes, plan_stacks
+from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.request import Request
 
 Result = TypeVar("Result")
 SAME = 1e-6
 """Largest difference of joints [rad] and poses [m, 1] of the same grasp."""
+SPEC = ContactSpec(friction=0.8, table=0.0)
+POINTS = 1000
+"""Points of a cloud: as many as the planner takes of the target of a scene."""
 
 
 @bench("gpu/clouds")
 def plan_clouds(o: Options) -> list[Row]:
-    """Plan batches of clouds at once, on a GPU if there is one, and each cloud alone on one thread of the CPU."""
+    """Plan batches of clouds at once, on a GPU if there is one; the smallest batch also on the cores of the CPU."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    hand, spec, rows = load_hand(o.hands[0]), ContactSpec(friction=0.8, table=0.0), list[Row]()
-    plan_stack([Request(cloud, hand, spec, 20) for cloud in views(2)], device)  # what a process keeps is made before
-    for count in o.batches:
-        clouds = views(count)
-        requests = [Request(cloud.to(device), hand, spec, o.starts) for cloud in clouds]
-        together, seconds = timed(lambda requests=requests: plan_stack(requests, device), device)
-        alone, before = timed(
-            lambda clouds=clouds: [plan_grasps(cloud, hand, spec, o.starts) for cloud in clouds], torch.device("cpu")
-        )
-        memory = torch.cuda.max_memory_allocated() / 2**30 if device.type == "cuda" else 0.0
-        rows.append(
-            compare(f"{count} clouds, {hand.name}, {o.starts} starts", alone, together, before, seconds, memory)
-        )
+    hand, workers, rows = load_hand(o.hands[0]), max(o.workers, 1), list[Row]()
+    packed = run_tasks(see_view, [(k,) for k in range(max(o.batches))], workers, 600.0)
+    seen = [pickle.loads(x) for x in packed if isinstance(x, bytes)]  # noqa: S301 of our own processes
+    requests = [Request(cloud, hand, SPEC, o.starts) for cloud in seen]
+    problems, shaped = timed(lambda: list(estimate_shapes(requests, workers)))
+    rows.append(Row(f"shapes of {len(seen)} clouds, {workers} processes", "-", f"{shaped:.1f} s", None, {"s": shaped}))
+    plan_at_once(requests[:2], problems[:2], device)  # what a process keeps is made before
+    call = partial(plan_grasps, hand=hand, spec=SPEC, starts=o.starts, workers=workers)
+    for count in sorted(o.batches):
+        what = f"{count} clouds of {POINTS} points, {hand.name}, {o.starts} starts"
+        there = [cloud.to(device) for cloud in seen[:count]]
+        known = partial(plan_at_once, requests[:count], problems[:count], device)
+        row, found = measure(f"{what}: at once, with known shapes", known)
+        rows += [row, measure(f"{what}: a whole call", partial(call, there))[0]]
+        if count == min(o.batches):
+            row, alone = measure(f"{what}: a whole call on the CPU", partial(call, seen[:count]))
+            rows += [row, compare(f"{what}: at once beside each alone on the CPU", alone, found)]
+        print(*rows, sep="\n", flush=True)
     return rows
 
 
-def timed(function: Callable[[], Result], device: torch.device) -> tuple[Result, float]:
-    """Return the result of a function, and the wall time [s] that it took on a device."""
+def see_view(k: int) -> bytes:
+    """Return a view of a shipped object with few points, packed, for another process."""
+    torch.set_num_threads(1)
+    cloud = views(1, k)[0]
+    rows = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(k))[:POINTS].sort().values
+    return pickle.dumps(cloud.select(rows))
+
+
+@checked
+def plan_at_once(requests: list[Request], problems: list[Problem | Grasps], device: torch.device) -> list[Grasps]:
+    """Return the grasps of problems with known shapes, planned at once on a device."""
+    return list(plan_stacks(requests, iter(problems), device))
+
+
+def measure(what: str, plan: Callable[[], list[Grasps]]) -> tuple[Row, list[Grasps]]:
+    """Return the row of a plan of many clouds, and its grasps."""
+    cuda = torch.cuda.is_available()
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    found, seconds = timed(plan)
+    memory = torch.cuda.max_memory_allocated() / 2**30 if cuda else 0.0
+    rate = sum(int((grasps.status == Status.OK).sum()) for grasps in found) / seconds
+    text = f"{rate:.0f} executable a second; {seconds:.2f} s, {memory:.1f} GiB on the GPU"
+    return Row(what, "-", text, None, {"seconds": seconds, "rate": rate, "memory": memory}), found
+
+
+def timed(function: Callable[[], Result]) -> tuple[Result, float]:
+    """Return the result of a function, and the wall time [s] that it took."""
     began = time.perf_counter()
     result = function()
-    if device.type == "cuda":
-        torch.cuda.synchronize()
     return result, time.perf_counter() - began
 
 
-def compare(
-    what: str, alone: list[Grasps], together: list[Grasps], before: float, seconds: float, memory: float
-) -> Row:
-    """Return the row of a batch: the rows with the same status and the same grasp, and executable grasps a second."""
+def compare(what: str, alone: list[Grasps], together: list[Grasps]) -> Row:
+    """Return the row of a batch: the rows with the same status, and with the same joints and pose."""
     pairs = [(one, other.to("cpu")) for one, other in zip(alone, together, strict=True)]
     every = sum(len(one) for one, _ in pairs)
     status = sum(int((one.status == other.status).sum()) for one, other in pairs if len(one) == len(other))
     same = sum(
         int((torch.cdist(numbers(one), numbers(other), p=torch.inf).amin(1) < SAME).sum()) for one, other in pairs
     )
-    counts = [sum(int((grasps.status == Status.OK).sum()) for grasps in found) for found in zip(*pairs, strict=True)]
-    text = (
-        f"status in {status} of {every} rows, joints and pose in {same}; {counts[1] / seconds:.0f} executable a second "
-        f"at once, {counts[0] / before:.0f} on one thread of the CPU; {memory:.1f} GiB on the GPU"
-    )
-    return Row(
-        what, "the same in all rows", text, status == every,
-        {"rows": every, "status": status, "same": same, "executable": counts, "seconds": [before, seconds],
-         "memory": memory},
-    )  # fmt: skip
+    text = f"status in {status} of {every} rows, joints and pose in {same}"
+    return Row(what, "the same in all rows", text, status == every, {"rows": every, "status": status, "same": same})
 
 
 def numbers(grasps: Grasps) -> Tensor:

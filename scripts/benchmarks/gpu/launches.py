@@ -48,10 +48,10 @@ def count_launches(o: Options) -> list[Row]:
     return rows + [lines_row(kind, last.most(kind, 10), size) for kind in KINDS]
 
 
-def views(count: int) -> list[PointCloud]:
-    """Return views of the shipped objects: first the shipped ones, then from other sides; the first is of the jug."""
+def views(count: int, first: int = 0) -> list[PointCloud]:
+    """Return views of the shipped objects: first the shipped ones, then from other sides; number 0 is of the jug."""
     names = ("jug", *(name for name in OBJECTS if name != "jug"))
-    return [see(names[k % len(names)], k // len(names)) for k in range(count)]
+    return [see(names[k % len(names)], k // len(names)) for k in range(first, first + count)]
 
 
 def count_plans(hand: Hand, clouds: list[PointCloud], starts: int) -> Launches:

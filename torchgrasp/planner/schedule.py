@@ -1,0 +1,29 @@
+"""The sizes of the planner's batches, each larger than the last, so that the first grasps come early."""
+
+from typing import NamedTuple
+
+FIRST, GROWTH = 8, 6
+"""Number of contact sets that the hand tries in the first batch, and ratio of the sizes of successive batches."""
+TRIED, TRIED_IN_SCENE = 250, 160
+"""Most contact sets that the hand tries: fewer in a scene, because there it tries more postures for each set."""
+OFFERED = 4  # planned rows for each row that the hand tries
+
+
+class Batch(NamedTuple):
+    """The size of one batch: the number of new initial guesses, and of contact sets that the hand tries."""
+
+    starts: int
+    tried: int
+
+
+def schedule(starts: int, most: int) -> list[Batch]:
+    """Return batches with `starts` guesses and `most` contact sets in all; a small remainder joins the last batch."""
+    batches, size, most = list[Batch](), FIRST, min(most, starts)
+    tried = planned = 0
+    while tried < most:
+        size = size if most - tried >= 2 * size else most - tried
+        tried += size
+        further = min(starts, max(OFFERED * tried, starts * tried // most)) - planned
+        batches.append(Batch(further, size))
+        planned, size = planned + further, GROWTH * size
+    return batches
