@@ -34,7 +34,7 @@ KNOWN = {
     "ik/joint.py": "solve",
     "ik/motion.py": "_clearance find_approach",
     "ik/seeds.py": "_drawn nearest_postures",
-    "plan/certify.py": "certify",
+    "plan/certify.py": "_prove check_unit forward",
     "plan/closure.py": "_solve rank_ratio",
     "plan/feasibility.py": "check_feasibility normal_variation",
     "plan/problem.py": "of",
@@ -59,7 +59,7 @@ KNOWN = {
     "success/body.py": "around",
     "success/features.py": "_normal_deviation measure_grasps",
     "success/model.py": "depth",
-    "success/order.py": "rank_by_success",
+    "success/order.py": "grade",
     "values.py": "format_success select",
 }
 """The functions in which a plan may wait for the device, by file. A function that waits no more is to be deleted."""

@@ -150,7 +150,7 @@ def test_batches_plan_all_starts_and_try_all_rows():
 def offer(points, seeds_of):
     """Contacts at the given points; row i has the seeds `seeds_of[i]`, each known by its energy."""
     n, nan = len(points), torch.full((len(points),), torch.nan, dtype=torch.float64)
-    row = torch.tensor([i for i, found in enumerate(seeds_of) for _ in found])
+    row = torch.tensor([i for i, found in enumerate(seeds_of) for _ in found], dtype=torch.int64)
     energy = real([e for found in seeds_of for e in found])
     g = len(row)
     pose = rigid(torch.eye(3, dtype=torch.float64).expand(g, 3, 3), torch.zeros(g, 3, dtype=torch.float64))
@@ -182,3 +182,22 @@ def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
         gone += rows
     assert sorted(gone) == [i for i in range(30) if i != 4]
     assert len(untried.take(5).contacts) == 0
+
+
+def test_the_contact_sets_of_several_clouds_are_chosen_at_once_as_those_of_each_alone():
+    rng, clouds = torch.Generator().manual_seed(4), 3
+    points = torch.rand(40, 3, 3, generator=rng, dtype=torch.float64)
+    cost = torch.rand(40, generator=rng, dtype=torch.float64)
+    cost[7], owner = torch.inf, torch.randint(clouds - 1, (40,), generator=rng) * 2  # the cloud in the middle has none
+    together, alone = Pool(clouds), [Pool(1) for _ in range(clouds)]
+    for rows in (torch.arange(15), torch.arange(15, 40)):
+        part = offer(points[rows], [[0.0]] * len(rows))
+        together.add(part._replace(owner=owner[rows]), cost[rows])
+        for k, pool in enumerate(alone):
+            own = rows[owner[rows] == k]
+            pool.add(offer(points[own], [[0.0]] * len(own)), cost[own])
+        most = 4 if rows[0] == 0 else 9
+        found = together.take(most)
+        expected = [pool.take(most).contacts.points for pool in alone]
+        assert torch.equal(found.contacts.points, torch.cat(expected))
+        assert torch.bincount(found.owner, minlength=clouds).tolist() == [len(x) for x in expected]

@@ -27,7 +27,7 @@ from torchgrasp.planner.problem import digest
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, encode_fingertips, load_mixture
 from torchgrasp.success.explain import measure_again
 from torchgrasp.success.model import load_model
-from torchgrasp.success.order import rank_by_success
+from torchgrasp.success.order import by_success, grade
 from torchgrasp.success.promise import Promise
 
 SPEC = ContactSpec(table=0.0)
@@ -59,7 +59,7 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
     assert bool((scores[:-1] >= scores[1:]).all())
     good = int((grasps.status == Status.OK).sum())
     odds = torch.randn(good, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ranked = rank_by_success(grasps, odds, torch.ones(good, dtype=torch.bool))
+    ranked = by_success(grade(grasps, odds, torch.ones(good, dtype=torch.bool)))
     assert torch.equal(ranked.score[:good], odds.sort(descending=True).values.to(grasps.score))
     assert bool((ranked.status[:good] == Status.OK).all()) and not bool((ranked.status[good:] == Status.OK).any())
     torch.testing.assert_close(ranked.success[:good], torch.sigmoid(ranked.score[:good]))

@@ -67,7 +67,7 @@ def test_the_order_is_known_then_unknown_then_failed_each_by_falling_score(gener
 def test_scores_intervals_and_knowledge_are_those_of_the_executable_grasps(model):
     rows = grasps_of([9.0, 8.0, 7.0, 6.0], [OK, FAILED, OK, OK])
     odds, known = real([-1.0, 3.0, 2.0]), torch.tensor([True, False, True])
-    ranked = order.rank_by_success(rows, odds, known)
+    ranked = order.by_success(order.grade(rows, odds, known))
     assert ranked.score.tolist() == [2.0, -1.0, 3.0, 8.0] and ranked.status.tolist() == [OK, OK, OK, FAILED]
     assert ranked.known.tolist() == [True, True, False, True]
     near(ranked.interval[:2], MODEL.interval(real([2.0, -1.0])), 1e-9)
@@ -78,9 +78,9 @@ def test_scores_intervals_and_knowledge_are_those_of_the_executable_grasps(model
 
 def test_float32_and_no_grasps_keep_their_dtype_and_shape(model):
     rows = grasps_of([1.0, 2.0]).to(torch.float32)
-    ranked = order.rank_by_success(rows, real([0.5, 1.5]), torch.tensor([True, True]))
+    ranked = order.by_success(order.grade(rows, real([0.5, 1.5]), torch.tensor([True, True])))
     assert ranked.score.dtype == ranked.interval.dtype == torch.float32 and ranked.score.tolist() == [1.5, 0.5]
-    none = order.rank_by_success(rows[:0], real([]), torch.zeros(0, dtype=torch.bool))
+    none = order.by_success(order.grade(rows[:0], real([]), torch.zeros(0, dtype=torch.bool)))
     assert none.interval.shape == (0, 2) and len(order.by_success(none)) == 0
     assert len(order.keep_promise(none, 0.9)) == 0
 
@@ -93,20 +93,20 @@ def promised(monkeypatch, found):
 def test_a_promise_refuses_executable_grasps_below_its_bound_or_unknown_ones(monkeypatch):
     promised(monkeypatch, Promise(1.0, 100, 50))
     rows = grasps_of([3.0, 0.9, 2.0, 1.0, 5.0], [OK, OK, OK, OK, FAILED], [True, True, False, True, True])
-    kept = order.keep_promise(rows, 0.9)
+    kept = order.by_success(order.keep_promise(rows, 0.9))
     refused = int(Status.NO_PROMISE)
     assert kept.status.tolist() == [OK, OK, FAILED, refused, refused]
     assert kept.score.tolist() == [3.0, 1.0, 5.0, 2.0, 0.9]  # refused grasps keep their predictions
     assert kept.success.tolist()[2:] == [0.0, 0.0, 0.0]
-    again = order.keep_promise(kept, 0.9)
+    again = order.by_success(order.keep_promise(kept, 0.9))
     assert again.status.tolist() == kept.status.tolist()
-    every = order.keep_promise(dataclasses.replace(rows, known=None), 0.9)
+    every = order.by_success(order.keep_promise(dataclasses.replace(rows, known=None), 0.9))
     assert sorted(every.status.tolist()) == sorted([OK, OK, OK, FAILED, refused])
 
 
 def test_without_a_bound_no_executable_grasp_is_promised(monkeypatch):
     promised(monkeypatch, None)
-    kept = order.keep_promise(grasps_of([30.0, 3.0, 1.0], [OK, OK, FAILED]), 0.9)
+    kept = order.by_success(order.keep_promise(grasps_of([30.0, 3.0, 1.0], [OK, OK, FAILED]), 0.9))
     assert int(Status.OK) not in kept.status.tolist() and FAILED in kept.status.tolist()
 
 

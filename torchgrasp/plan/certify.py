@@ -74,10 +74,10 @@ class _Proof(torch.autograd.Function):
         b, m, _ = wrench.shape
         margin, ratio, residual = (wrench.new_full((b,), torch.nan) for _ in range(3))
         witness, phi, dual = (wrench.new_full((b, width), torch.nan) for width in (6, m, 6))
-        finite = torch.isfinite(wrench).flatten(1).all(-1)
-        known = wrench[finite]
-        ratio[finite] = rank_ratio(known[:, None])
-        margin[finite], residual[finite], witness[finite], phi[finite], dual[finite] = _prove(known)
+        rows = torch.nonzero(torch.isfinite(wrench).flatten(1).all(-1))[:, 0]
+        known = wrench[rows]
+        ratio[rows] = rank_ratio(known[:, None])
+        margin[rows], residual[rows], witness[rows], phi[rows], dual[rows] = _prove(known)
         balanced = (margin >= MIN_MARGIN) & (residual <= MAX_RESIDUAL)
         closed = balanced & (ratio >= MIN_RANK_RATIO) & ~flat
         lacking = torch.nonzero(balanced & ~closed)[:, 0]

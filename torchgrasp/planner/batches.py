@@ -3,6 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -23,7 +24,7 @@ from torchgrasp.planner.stack import Owner, Stack, by_cloud
 from torchgrasp.specs import Ranking
 from torchgrasp.success.features import measure_grasps
 from torchgrasp.success.model import load_model
-from torchgrasp.success.order import by_success, is_known, keep_promise, rank_by_success, rank_by_variance
+from torchgrasp.success.order import by_success, grade, is_known, keep_promise, rank_by_variance
 from torchgrasp.values import ContactPlan, Grasps
 
 FIRST_STEPS = 8
@@ -227,14 +228,13 @@ def rank(stack: Stack, solved: Owned) -> list[Grasps]:
     if len(stack) > 1:  # the host sorts
         cpu = torch.device("cpu")
         grasps, log_odds, known, owner, rows = grasps.to(cpu), log_odds.cpu(), known.cpu(), owner.cpu(), rows.cpu()
-    clouds = zip(stack.problems, by_cloud(owner, len(stack)), by_cloud(owner[rows], len(stack)), strict=True)
-    found = list[Grasps]()
-    for one, own, k in clouds:
-        ranked = rank_by_success(grasps[own], log_odds[k], known[k] & (not one.vague))
-        if request.promise is not None:
-            ranked = keep_promise(ranked, request.promise)
-        found.append(ranked if request.order == "success" else rank_by_variance(ranked))
-    return found
+    vague = torch.tensor([one.vague for one in stack.problems], device=known.device)
+    graded = grade(grasps, log_odds, known & ~vague[owner[rows]])
+    if request.promise is not None:
+        graded = keep_promise(graded, request.promise)
+    ranked, counts = by_success(graded, owner), torch.bincount(owner, minlength=len(stack)).tolist()
+    found = [ranked[last - count : last] for last, count in zip(accumulate(counts), counts, strict=True)]
+    return found if request.order == "success" else [rank_by_variance(one) for one in found]
 
 
 def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:

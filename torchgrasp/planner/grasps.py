@@ -73,7 +73,7 @@ def plan_grasps(
         starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
         time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of planned guesses.
-        workers: number of processes for a sequence of clouds; 0 means this process.
+        workers: number of processes for a sequence of clouds; 0 means this process. On a GPU they estimate the shapes.
         fingers: the fingers that grasp, as in `load_hand`; by default those of `hand`. "auto" chooses, of the sets that
             the hand declares, the one with the greatest expected success. `hand_of` loads the hand of the result.
         mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.

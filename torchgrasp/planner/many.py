@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
@@ -56,11 +57,18 @@ def plan_stacks(
     most = 128  # clouds at once: a device plans more of them hardly faster, and their rows would fill its memory
     budget = requests[0].time_budget if requests else None
     deadline = math.inf if budget is None else time.monotonic() + budget
+    stack = _take(prepared, most)
     with ThreadPoolExecutor(1) as beside:
-        ahead = beside.submit(lambda: list(itertools.islice(prepared, most)))
         for first in range(0, len(requests), most):
-            stack, ahead = ahead.result(), beside.submit(lambda: list(itertools.islice(prepared, most)))
+            ahead = beside.submit(_take, prepared, most) if first + most < len(requests) else None
             yield from _plan_stack(requests[first : first + most], stack, device, deadline)
+            stack = [] if ahead is None else ahead.result()
+
+
+@checked
+def _take(prepared: Iterator[Problem | Grasps], count: int) -> list[Problem | Grasps]:
+    """Return the next problems of an iterator; in any thread the library does not check its own calls."""
+    return list(itertools.islice(prepared, count))
 
 
 def estimate_shapes(requests: Sequence[Request], workers: int) -> Generator[Problem | Grasps, None, None]:

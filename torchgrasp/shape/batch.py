@@ -48,7 +48,7 @@ class Walls(Value):
         near = max(shape.n_oriented for shape in shapes)
         n = near + max(len(shape.x) - shape.n_oriented for shape in shapes)
         x, a, b = (shapes[0].x.new_zeros(len(shapes), *size) for size in ((n, 3), (n,), (near, 3)))
-        factor = torch.eye(n + 3 * near, dtype=x.dtype, device=x.device).repeat(len(shapes), 1, 1)
+        factor = torch.eye(n + 3 * near, dtype=x.dtype, device=device).repeat(len(shapes), 1, 1)
         place_of = torch.zeros(len(shapes), n + 3 * near, dtype=torch.long, device=x.device)
         for w, shape in enumerate(shapes):
             oriented = torch.arange(shape.n_oriented, device=x.device)
@@ -59,7 +59,7 @@ class Walls(Value):
             missing = torch.ones(len(place_of[w]), dtype=torch.bool, device=x.device).index_fill(0, rows, False)
             place_of[w] = torch.cat([shape.ordered(rows), torch.nonzero(missing)[:, 0]])
         psi, counts = (x.new_tensor(y) for y in zip(*((s.psi, len(s.factor)) for s in shapes), strict=True))
-        x, a, b, psi, factor, place_of = (y.to(device) for y in (x, a, b, psi, factor, place_of))
+        x, a, b, psi, place_of = (y.to(device) for y in (x, a, b, psi, place_of))
         known = torch.arange(n + 3 * near, device=device) < counts.to(device)[:, None]  # no column for what is missing
         inverse = torch.linalg.solve_triangular(factor.mT, torch.diag_embed(known.to(factor)), upper=True)
         whitener = torch.empty_like(inverse).scatter_(1, place_of[..., None].expand_as(inverse), inverse)

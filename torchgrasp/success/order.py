@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument, Status
@@ -30,33 +30,33 @@ def largest_known() -> float:
     return float(load_model().range[FEATURES.index("size"), 1])
 
 
-def rank_by_success(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]) -> Grasps:
-    """Set score, interval and `known` of the k executable grasps by their log-odds; return all grasps, best first."""
-    good, score = grasps.status == Status.OK, grasps.score.clone()
+def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]) -> Grasps:
+    """Return grasps with score, interval and `known` of the k executable ones by their log-odds of success."""
+    good, score = torch.nonzero(grasps.status == Status.OK)[:, 0], grasps.score.clone()
     score[good] = log_odds.to(score)
-    interval, supported = torch.zeros_like(score)[:, None].repeat(1, 2), torch.ones_like(good)
+    interval, supported = torch.zeros_like(score)[:, None].repeat(1, 2), torch.ones_like(score, dtype=torch.bool)
     bounds = load_model(log_odds.device).interval(log_odds).where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
     interval[good], supported[good] = bounds.to(score), known
-    return by_success(dataclasses.replace(grasps, score=score, interval=interval, known=supported))
+    return dataclasses.replace(grasps, score=score, interval=interval, known=supported)
 
 
 def keep_promise(grasps: Grasps, share: float) -> Grasps:
-    """Give the status `NO_PROMISE` to executable grasps of which a `share` may not hold, and return all, best first."""
+    """Return grasps, in which executable ones of which a `share` may not hold have the status `NO_PROMISE`."""
     promise = find_promise(share)
     least = math.inf if promise is None else promise.least
     sure = grasps.score >= least if grasps.known is None else (grasps.score >= least) & grasps.known
     broken = (grasps.status == Status.OK) & ~sure
-    return by_success(dataclasses.replace(grasps, status=grasps.status.masked_fill(broken, int(Status.NO_PROMISE))))
+    return dataclasses.replace(grasps, status=grasps.status.masked_fill(broken, int(Status.NO_PROMISE)))
 
 
-def by_success(grasps: Grasps) -> Grasps:
-    """Sort grasps: executable ones with a known success, other executable ones, failed ones.
+def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
+    """Sort grasps by the `groups`, in each: executable ones with a known success, other executable ones, failed ones.
 
-    In each group the score falls; the greater margin of the certificate decides between equal scores.
+    Among these the score falls; the greater margin of the certificate decides between equal scores.
     """
     late = 2 * (grasps.status != Status.OK).int()
     late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()
-    return grasps[lexical_order(late, -grasps.score, -grasps.certificate.margin)]
+    return grasps[lexical_order(*groups, late, -grasps.score, -grasps.certificate.margin)]
 
 
 def rank_by_variance(grasps: Grasps) -> Grasps:
