@@ -94,9 +94,9 @@ def test_clouds_planned_together_have_the_grasps_of_each_alone(device, hand):
         assert share_found(here, there.to("cpu")) > 0.9  # rounding may move a few
 
 
-def test_a_worker_plans_where_its_cloud_is(device, hand, monkeypatch):
+def test_workers_estimate_shapes_for_plans_where_the_clouds_are(device, hand, monkeypatch):
     """The workers are played by this process, which alone knows the pretended device."""
-    serial = lambda function, tasks, workers, limit: [function(*task) for task in tasks]  # noqa: E731
+    serial = lambda function, tasks, workers, limit: (function(*task) for task in tasks)  # noqa: E731
     monkeypatch.setattr("torchgrasp.planner.many.run_tasks", serial)
     expected = plan_grasps([VIEW], hand, SPEC, 2)
     same(plan_grasps([sent(VIEW)], hand, SPEC, 2, workers=1), expected)

@@ -151,8 +151,9 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
     margin, residual = torch.where(unbalanced, -torch.inf, margin), torch.where(unbalanced, torch.inf, residual)
     proven = (residual <= EXACT) & (upper - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
     for row in torch.nonzero(~(proven | unbalanced))[:, 0].tolist():
-        margin[row], residual[row], dual, phi[row] = solve_by_highs(wrench[row].cpu().numpy())
-        witness[row] = witness[row] if dual is None else torch.from_numpy(dual)
+        margin[row], residual[row], dual, balance = solve_by_highs(wrench[row].cpu().numpy())
+        phi[row] = balance.to(phi)
+        witness[row] = witness[row] if dual is None else torch.from_numpy(dual).to(witness)
     product = (wrench @ witness[..., None])[..., 0]
     dual = witness / (product - product.amin(-1, keepdim=True)).sum(-1, keepdim=True)
     dual = torch.where(margin.isinf()[:, None], torch.nan, dual)

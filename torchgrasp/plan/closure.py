@@ -199,18 +199,29 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
     inward, position = -normals @ basis, arm @ basis
     projected = torch.linalg.vector_norm(inward, dim=-1)
     cone = math.cos(math.atan(friction))
-    half = torch.arccos((cone / projected).clamp(max=1.0))
+    rows = torch.nonzero((projected > cone).all(-1))[:, 0]  # the others have a cone that the plane does not cut
+    closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    closed[rows] = _spans_plane(inward[rows], position[rows], torch.arccos(cone / projected[rows]))
+    return closed
+
+
+def _spans_plane(
+    inward: Float[Tensor, "b 3 2"], position: Float[Tensor, "b 3 2"], half: Float[Tensor, "b 3"]
+) -> Bool[Tensor, "b"]:
+    """Return which sets of three planar cones positively span all planar wrenches.
+
+    A cone has its apex at a `position`, and its axis along `inward`, with an angle `half` [rad] between axis and sides.
+    """
     middle = torch.atan2(inward[..., 1], inward[..., 0])
     angle = torch.stack([middle - half, middle + half], -1)  # (b, 3, 2)
     c, s = angle.cos(), angle.sin()
     planar = torch.stack([c, s, position[..., 0, None] * s - position[..., 1, None] * c], -1).flatten(1, 2)
-    first, second = subsets(6, 2, points.device).unbind(-1)
+    first, second = subsets(6, 2, inward.device).unbind(-1)
     plane = torch.linalg.cross(planar[:, first], planar[:, second])  # (b, 15, 3)
     side = plane @ planar.mT  # (b, 15, 6)
     spans = torch.linalg.vector_norm(plane, dim=-1) > PARALLEL
     both = (side.amax(-1) > PARALLEL) & (side.amin(-1) < -PARALLEL)
-    spanned = (both | ~spans).all(-1) & spans.any(-1)
-    return spanned & (projected > cone).all(-1)
+    return (both | ~spans).all(-1) & spans.any(-1)
 
 
 def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: Guess) -> Bool[Tensor, "b"]:

@@ -55,7 +55,7 @@ class Walls(Value):
             place = torch.cat([oriented, near + torch.arange(len(shape.x) - len(oriented), device=x.device)])
             rows = torch.cat([place, *(n + k * near + oriented for k in range(3))])
             x[w, place], a[w, place], b[w, oriented], _ = shape.weighted
-            factor[w, : len(rows), : len(rows)] = shape.factor
+            factor[w, : len(rows), : len(rows)] = shape.factor.to(device)
             missing = torch.ones(len(place_of[w]), dtype=torch.bool, device=x.device).index_fill(0, rows, False)
             place_of[w] = torch.cat([shape.ordered(rows), torch.nonzero(missing)[:, 0]])
         psi, counts = (x.new_tensor(y) for y in zip(*((s.psi, len(s.factor)) for s in shapes), strict=True))
