@@ -7,8 +7,6 @@ signature: type, shape, dtype, finite numbers, range. Calls that the library mak
 import collections.abc
 import dataclasses
 import functools
-import importlib
-import importlib.util
 import inspect
 import threading
 import types
@@ -267,26 +265,13 @@ def _lengths(value: Any) -> dict[str, int]:
 
 @functools.cache
 def _hints(thing: Any) -> dict[str, Any]:
-    """Return the annotations of a function or class; names imported only for type checkers are resolved, too."""
-    late: dict[str, Any] = {}
-    while True:
-        try:
-            return typing.get_type_hints(thing, localns=late, include_extras=True)
-        except NameError as error:
-            name = str(error.name)
-            late[name] = importlib.import_module(name) if importlib.util.find_spec(name) else _ByName(name, (), {})
+    """Return the annotations of a function or class."""
+    return typing.get_type_hints(thing, include_extras=True)
 
 
 def _option(hint: Any, key: str) -> Any:
     """Return the type annotation of the keyword argument `key` of `**options`."""
     return _hints(typing.get_args(hint)[0]).get(key, Any) if typing.get_origin(hint) is Unpack else hint
-
-
-class _ByName(type):
-    """A stand-in for a class that is not loaded yet: every class with this name counts as its instance."""
-
-    def __instancecheck__(cls, instance: Any) -> bool:
-        return cls.__name__ in {base.__name__ for base in type(instance).__mro__}
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:

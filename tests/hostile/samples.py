@@ -49,8 +49,7 @@ NONE: Lengths = types.MappingProxyType({})
 
 def hints_of(thing: Any) -> dict[str, Any]:
     """Return the annotations of a function or dataclass with their marks."""
-    late = {"trimesh": trimesh, "StabilityModel": StabilityModel}
-    hints = typing.get_type_hints(thing, localns=late, include_extras=True)
+    hints = typing.get_type_hints(thing, include_extras=True)
     return {name: hint for name, hint in hints.items() if name != "return"}
 
 

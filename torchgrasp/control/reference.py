@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,6 +13,7 @@ from torchgrasp.base import Value
 from torchgrasp.checks import ANY, Force, Pose, Positive, Range, check_tensor, checked
 from torchgrasp.closure import ClosingGains, SensorModel
 from torchgrasp.control import forces, law
+from torchgrasp.control.paper.stability import StabilityModel
 from torchgrasp.control.tactile import Observation
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
@@ -23,9 +24,6 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import opened_pose
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps
-
-if TYPE_CHECKING:
-    from torchgrasp.control.paper.stability import StabilityModel
 
 
 @checked
@@ -83,7 +81,7 @@ class ClosingReference(Value):
         grasp: Grasps,
         force: Force = 4.0,
         kp: Positive | None = None,
-        stability: "StabilityModel | None" = None,
+        stability: StabilityModel | None = None,
     ) -> "ClosingReference":
         """Return the closing plan of one grasp, on the CPU.
 
@@ -239,7 +237,7 @@ def _number(grasp: Grasps, name: str) -> float | None:
 
 @checked
 def closing_gains(
-    grasp: Grasps, hand: Hand, force: Force = 4.0, stability: "StabilityModel | None" = None
+    grasp: Grasps, hand: Hand, force: Force = 4.0, stability: StabilityModel | None = None
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.
 

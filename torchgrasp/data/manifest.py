@@ -13,7 +13,6 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -23,10 +22,8 @@ from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.errors import DatasetError
 from torchgrasp.files import Field, format_json, read_json, write_file
 from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.lazy import trimesh
 from torchgrasp.values import PointCloud
-
-if TYPE_CHECKING:
-    import trimesh
 
 WHOLE = "whole"  # name of the view that shows an object from all sides, with normals: `full_normals.ply`
 MOST_SCALE, MOST_METRES, MOST_MASS = 1e4, 1e4, 1e4

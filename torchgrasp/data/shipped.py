@@ -2,19 +2,16 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from torchgrasp.checks import checked
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.errors import BadArgument
+from torchgrasp.lazy import trimesh
 from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.values import Grasps, PointCloud, load_grasps
-
-if TYPE_CHECKING:
-    import trimesh
 
 __all__ = ["GraspObject", "list_objects", "load_object", "load_scene", "load_shipped_grasp"]
 
@@ -64,8 +61,6 @@ def load_object(name: str) -> GraspObject:
     >>> jug.mesh.is_watertight, len(jug.view)
     (True, 1000)
     """
-    import trimesh
-
     if name not in MASSES:
         raise BadArgument("name", repr(name), f"one of {', '.join(MASSES)}")
     mesh = trimesh.load_mesh(DATA / name / "mesh.ply")

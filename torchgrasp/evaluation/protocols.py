@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import json
 import math
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -15,12 +15,10 @@ from torchgrasp.checks import Count, Length, Pose, Range, Seed, check_tensor, ch
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.lazy import trimesh
 from torchgrasp.specs import TrialSpec
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values import Grasps
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 @checked

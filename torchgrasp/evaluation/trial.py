@@ -5,7 +5,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -29,16 +28,12 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
+from torchgrasp.lazy import trimesh
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.specs import ClosingMode, TrialSpec
 from torchgrasp.values import Grasps
-
-if TYPE_CHECKING:
-    import trimesh
-
-    Solid = trimesh.Trimesh | Path | str
 
 
 @checked
@@ -111,7 +106,7 @@ class TrialDriver:
     def _scene_spec(self, hand: Hand, grasp: Grasps) -> SceneSpec:
         """Return the parameters of the simulated scene; the hand's true pose in it includes the trial's pose error."""
         spec, truth, drives, rise = self.spec, self.trial.truth, hand.actuators, self.reference.rise
-        body = self._body(truth.mesh, truth.parts)
+        body = self._body(truth)
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], truth.error)
@@ -123,14 +118,14 @@ class TrialDriver:
             timestep=spec.timestep, travel=spec.lift_height,
             approach=tuple(approach.tolist()), table=spec.table, patch=spec.patch,
             height=None if truth.table is None else 0.0,
-            neighbours=tuple(self._body(x.mesh, x.parts, x.mass) for x in truth.neighbours),
+            neighbours=tuple(self._body(x, x.mass) for x in truth.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
             yields=spec.components.palm_reach + 1.5 * REACH * (truth.camera is not None) + float(rise.norm()),
         )  # fmt: skip
 
-    def _body(self, given: "Solid", parts: "Sequence[trimesh.Trimesh] | None", mass: float | None = None) -> Body:
+    def _body(self, given: Truth | Neighbour, mass: float | None = None) -> Body:
         """Return a mesh as a body of the scene: in the simulator's frame, with its convex parts and its mass [kg]."""
-        mesh, parts = read_solid(given, parts)
+        mesh, parts = read_solid(given.mesh, given.parts)
         if mass is None:
             mass = self.spec.mass if self.spec.density is None else self.spec.density * float(mesh.volume)
         if self.trial.truth.table is not None:

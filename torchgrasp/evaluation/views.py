@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -29,6 +29,7 @@ from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of, load_hand
+from torchgrasp.lazy import trimesh
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.problem import digest
 from torchgrasp.shape.fit import fit_shape
@@ -36,9 +37,6 @@ from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud, load_grasps
-
-if TYPE_CHECKING:
-    import trimesh
 
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
 

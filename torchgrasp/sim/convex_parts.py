@@ -8,7 +8,7 @@ import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,11 +17,8 @@ from torchgrasp.checks import checked
 from torchgrasp.errors import MeshError, ModelFileError, OutputError
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.geometry.mesh import LEAST_VOLUME, check_solid, read_mesh
+from torchgrasp.lazy import trimesh
 from torchgrasp.sim.decompose import decompose
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """Settings of CoACD's search for cuts, which make it narrower and faster than by default."""
@@ -44,8 +41,6 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))
     1
     """
-    import trimesh
-
     mesh = read_mesh(mesh)
     if mesh.is_convex:
         return [hull(mesh.vertices)]
@@ -77,8 +72,6 @@ def read_solid(
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
     """Return the convex hull of points; the points are rounded if the mesh of the hull would not be closed."""
-    import trimesh
-
     with np.errstate(divide="ignore", invalid="ignore"):
         body = trimesh.convex.convex_hull(corners)
         return body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
