@@ -170,6 +170,8 @@ class TrialSpec(Value):
     """Parameters of a simulated trial: close the hand on the true object, lift it off the table, hold it.
 
     The controller does not know `mass`, `density`, `friction`, `gravity`, `patch` and the numbers of the simulator.
+    Raises `BadArgument` for a number outside its range, an unknown closing, holding or simulator, options of a closing
+    that has none, a sensor or force that the closing cannot use, or a control period below one timestep.
 
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
@@ -206,10 +208,6 @@ class TrialSpec(Value):
         overlap: largest overlap [m] of hand and object at the start; the object's convex parts bulge a little.
         table: whether the object stands on a table.
         self_collision: whether links of the hand collide with each other, in the pairs that the hand names.
-
-    Raises:
-        BadArgument: a number outside its range, an unknown closing, holding or simulator, options of a closing that
-            has none, a sensor or force that the closing cannot use, or a control period below one timestep.
 
     >>> TrialSpec(mass=0.3).pressing, TrialSpec(force=6.0).pressing
     ('grip', 'force')

@@ -29,6 +29,9 @@ LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list hav
 class CampaignSpec(Value):
     """Options of a campaign: protocol, trials, licence and size of the files.
 
+    Raises `BadArgument` for an unknown protocol, or trials of whole clouds, of grasps that were planned before, or of
+    other fingers than the hand's.
+
     Args:
         protocol: test protocol of each grasp, or its name in `torchgrasp.evaluation.PROTOCOLS`.
         trials: which views are planned on, and how many of their grasps are tried, with the hand's own fingers.
@@ -36,10 +39,6 @@ class CampaignSpec(Value):
         jobs_in_shard: number of jobs (an object and a view) in one file.
         device: "cuda" plans on all views of a file at once, on the workers of a Dask cluster that have a GPU and the
             resource "GPU". A GPU's rounding may change grasps.
-
-    Raises:
-        BadArgument: an unknown protocol, or trials of whole clouds, of grasps that were planned before, or of other
-            fingers than the hand's.
 
     >>> CampaignSpec("dexgraspbench").test.trial.friction
     0.6

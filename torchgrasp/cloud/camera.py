@@ -70,7 +70,9 @@ def partial_view(
     """Return n points [m] of a mesh that the default camera sees, with a viewpoint and without normals.
 
     By default the noise is that of an active stereo camera: noise and steps of the disparity, a smooth bias, flying and
-    missing pixels at rims, and surfaces that fade out at grazing angles.
+    missing pixels at rims, and surfaces that fade out at grazing angles. Raises `BadArgument` for fewer than 4 points
+    or a pose that is not rigid, `MeshError` for a mesh without faces, and `TooFewPoints` if the camera sees nothing of
+    the mesh.
 
     Args:
         mesh: surface of the object, in the object frame [m].
@@ -78,11 +80,6 @@ def partial_view(
         n: number of pixels drawn at random; if there are fewer pixels, all are returned.
         noise: True for the default noise, False for exact depths, the name of a camera, or a `SensorNoise`.
         seed: random seed of the noise and of the choice of points.
-
-    Raises:
-        BadArgument: fewer than 4 points; a pose that is not rigid.
-        MeshError: the mesh has no faces.
-        TooFewPoints: the camera sees nothing of the mesh.
 
     >>> import trimesh
     >>> box = trimesh.creation.box([0.06, 0.06, 0.1])

@@ -91,18 +91,14 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
 
     Each mesh is moved so that its lowest point is at z = 0 and the middle of its box above the origin. Each view is
     rendered by the depth camera of `partial_view` from a random side. The manifest is written last, so that a folder
-    with a manifest is complete.
+    with a manifest is complete. Raises `DatasetError` for no meshes or two meshes of one name, the errors of
+    `read_mesh`, and `OutputError` if the folder cannot be written.
 
     Args:
         meshes: folder of closed meshes [m], z up (.ply, .stl, .obj, .off).
         out: folder to write.
         views: number of views of each object.
         seed: random seed of cameras and noise.
-
-    Raises:
-        DatasetError: no meshes, or two meshes of one name.
-        MeshError, SuspiciousScale: as `read_mesh`.
-        OutputError: the folder cannot be written.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -151,10 +147,8 @@ def list_views(
 ) -> list[tuple[str, str]]:
     """Return sorted pairs of object and view, at most `most` views of each object, by default all.
 
-    `only` selects objects by name; with `whole` each object has the single view `WHOLE`, which shows all sides.
-
-    Raises:
-        DatasetError: no manifest, none of the objects in it, or a bad entry.
+    `only` selects objects by name; with `whole` each object has the single view `WHOLE`, which shows all sides. Raises
+    `DatasetError` for no manifest, none of the objects in it, or a bad entry.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -171,9 +165,7 @@ def list_views(
 def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
     """Return the point cloud of a noisy view without normals, with the position of the camera if `camera` is true.
 
-    Raises:
-        DatasetError: as `read_entry`, or no such view.
-        CloudFileError: a bad file.
+    Raises `DatasetError` as `read_entry` and for an unknown view, and `CloudFileError` for a bad file.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

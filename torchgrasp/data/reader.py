@@ -74,9 +74,7 @@ class GraspShards:
     def __getitem__(self, i: int) -> dict[str, Tensor]:
         """Return grasp i of the data set, with its cloud, as a dict of tensors by name.
 
-        Raises:
-            IndexError: no such grasp.
-            ModelFileError: the file of the shard with the grasp is damaged.
+        Raises `IndexError` for no such grasp, and `ModelFileError` if the file of its shard is damaged.
         """
         i = range(len(self))[operator.index(i)]
         j = bisect.bisect_right(self.starts, i) - 1
@@ -96,9 +94,8 @@ class GraspShards:
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
         """Return the cloud, the grasps and the results of trials of job j, in the precision of the file.
 
-        Raises:
-            IndexError: no such job.
-            ModelFileError: the file of its shard is missing, damaged, or belongs to another campaign.
+        Raises `IndexError` for no such job, and `ModelFileError` if its file is missing, damaged, or of another
+        campaign.
         """
         j = range(len(self.jobs))[j]
         row, records = self.recent.get(j // self.size, self._read).take(j % self.size)
@@ -126,13 +123,12 @@ def shard_path(folder: Path, k: int) -> Path:
 def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     """Open a data set that a campaign has written; shards are read on demand.
 
+    Raises `ModelFileError` if the campaign is not finished, or its card is damaged.
+
     Args:
         folder: folder of the data set.
         points: number of points that are drawn from each cloud, equal in every call; a smaller cloud repeats points.
             None means all points.
-
-    Raises:
-        ModelFileError: the campaign is not finished, or its card is damaged.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand

@@ -52,10 +52,7 @@ def list_objects() -> tuple[str, ...]:
 
 @checked
 def load_object(name: str) -> GraspObject:
-    """Return the shipped object with the given name: its mesh, mass and a noisy view.
-
-    Raises:
-        BadArgument: no such object.
+    """Return a shipped object by its name: mesh, mass and a noisy view; raise `BadArgument` for an unknown name.
 
     >>> jug = load_object("jug")
     >>> jug.mesh.is_watertight, len(jug.view)
@@ -72,14 +69,11 @@ def load_object(name: str) -> GraspObject:
 
 @checked
 def load_shipped_grasp(name: str, hand: str) -> Grasps:
-    """Return a shipped grasp of a shipped object, to close, draw or export at once.
+    """Return a shipped grasp of a shipped object, to close or draw at once; raise `BadArgument` for an unknown one.
 
     Args:
         name: "cylinder" or "jug".
         hand: "allegro" or "barrett".
-
-    Raises:
-        BadArgument: no such grasp.
 
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> grasp.joints.shape, grasp.certificate.closed

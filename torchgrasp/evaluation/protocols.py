@@ -47,6 +47,8 @@ class PullSpec(Value):
 class Protocol(Value):
     """The settings of the simulated trials that test a grasp: they pull at the object, or lift it if `pull` is None.
 
+    Raises `BadArgument` for a rotation during the approach, or a push or a displacement in a protocol of pulls.
+
     Args:
         name: the protocol's name.
         trial: parameters of the simulated trials.
@@ -57,9 +59,6 @@ class Protocol(Value):
         push: size of a force [N] in a random direction at the lifted object.
         relook: whether the camera looks at the object of a lift once more, from the same place, before the approach.
         tries: largest number of grasps to try in a lift: another grasp where the object stays behind (`lift_grasps`).
-
-    Raises:
-        BadArgument: a rotation during the approach, or a push or a displacement in a protocol of pulls.
     """
 
     name: str
@@ -152,10 +151,7 @@ PROTOCOLS = {
 
 @checked
 def find_protocol(protocol: Protocol | str) -> Protocol:
-    """Return a protocol, given its name or the protocol itself.
-
-    Raises:
-        BadArgument: an unknown name.
+    """Return a protocol, given its name or the protocol itself; raise `BadArgument` for an unknown name.
 
     >>> find_protocol("tabletop").trial.friction
     0.6

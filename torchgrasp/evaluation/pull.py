@@ -50,11 +50,8 @@ class PullResult(Value):
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
     """Close a hand on the true object and pull along the world's axes, from the same grasp, until a pull fails.
 
-    The object's motion includes its motion during the closing. `protocol` may be a name in `PROTOCOLS`.
-
-    Raises:
-        BadArgument: an unknown protocol, or a protocol that lifts; otherwise as `close_hand`.
-        MeshError, MissingExtra: as `close_hand`.
+    The object's motion includes its motion during the closing. `protocol` may be a name in `PROTOCOLS`. Raises the
+    errors of `close_hand`, and `BadArgument` for an unknown protocol, or a protocol that lifts.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

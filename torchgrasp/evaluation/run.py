@@ -34,7 +34,9 @@ def evaluate(
 ) -> Generator[ViewScore, None, None]:
     """Plan grasps on every view of a folder of objects, try them in simulation, and yield the score of each view.
 
-    Only the simulator uses the true mesh. An object with bad files or a bad entry gets a score with a refusal.
+    Only the simulator uses the true mesh. An object with bad files or a bad entry gets a score with a refusal. Raises
+    `BadArgument` for an unknown protocol or no objects, and `OutputError` if another run holds the folder or it cannot
+    be written. Without the simulator, or pebble for workers, `MissingExtra` is raised.
 
     Args:
         objects: a folder as in `torchgrasp.data`.
@@ -44,11 +46,6 @@ def evaluate(
         folder: folder for the executable grasps of each view, OBJECT/VIEW.safetensors; by default a temporary folder.
             No other run may write to it at the same time.
         workers: number of worker processes; the scores do not depend on it.
-
-    Raises:
-        BadArgument: an unknown protocol, or no objects.
-        OutputError: another run holds the folder, or it cannot be written.
-        MissingExtra: the simulator, or pebble for workers, is not installed.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object

@@ -49,6 +49,8 @@ Ranks = Literal["best", "spread"]
 class EvaluationSpec(Value):
     """Options of an evaluation: which views are planned on, and which of their grasps are tried.
 
+    Raises `BadArgument` for no grasps, or unknown ranks.
+
     Args:
         grasps: largest number of grasps to try for each view.
         ranks: "best" tries the best grasps, "spread" tries grasps spread evenly over all ranks.
@@ -59,9 +61,6 @@ class EvaluationSpec(Value):
         seed: random seed.
         views: largest number of views of each object; None means all views.
         fingers: as in `plan_grasps`; by default the hand's own fingers.
-
-    Raises:
-        BadArgument: no grasps, or unknown ranks.
     """
 
     grasps: Count = 20

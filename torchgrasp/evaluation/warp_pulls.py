@@ -26,11 +26,9 @@ def pull_grasps(
 
     The closing must be "open_loop", which needs no sensor. All six pulls of a trial begin from the same closed hand.
     `device` is Warp's: "cuda" or "cpu". `PullResult.force` is NaN; `seconds` is a trial's share of the wall time. On a
-    GPU the order of sums changes from run to run, and with it the last digits of the motion.
-
-    Raises:
-        BadArgument: no trial, more than one `Hand`, an unknown device, or a protocol that this cannot run.
-        MissingExtra: MuJoCo Warp is not installed; otherwise as `pull_grasp`.
+    GPU the order of sums changes from run to run, and with it the last digits of the motion. Raises `BadArgument` for
+    no trial, more than one `Hand`, an unknown device, or a protocol that this cannot run. Without MuJoCo Warp,
+    `MissingExtra` is raised; otherwise the errors are those of `pull_grasp`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -35,13 +35,11 @@ ANGLE_TOLERANCE = math.radians(2)  # largest angle [rad] of a contact direction 
 class GraspProblem(Value):
     """The input of a grasp solver: a hand, contact sets with certificates of force closure, and the collision world.
 
-    Contact sets of several objects have a centre each, and a world that knows the object of each row.
-    Grasps near `center`, the object's centre [m], score higher. The function `reachable` tells which hand poses an arm
-    can reach; without this function, every pose counts as reachable. A hand that `descends` may begin above its pose
-    where its opened links would be in the table (`opened_pose`).
-
-    Raises:
-        BadArgument: the contacts lack `std_m`, the surface's standard deviation, by which the pre-grasp opens.
+    Contact sets of several objects have a centre each, and a world that knows the object of each row. Grasps near
+    `center`, the object's centre [m], score higher. The function `reachable` tells which hand poses an arm can reach;
+    without this function, every pose counts as reachable. A hand that `descends` may begin above its pose where its
+    opened links would be in the table (`opened_pose`). Raises `BadArgument` if the contacts lack `std_m`, the surface's
+    standard deviation, by which the pre-grasp opens.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

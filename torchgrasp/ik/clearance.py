@@ -54,10 +54,7 @@ class Obstacles(Value):
     ) -> "Obstacles | None":
         """Return the obstacles of an occupancy grid, or None if all its voxels are probably free.
 
-        Voxels of probability `full` or more count as occupied.
-
-        Raises:
-            BadArgument: `full` outside [0.01, 1].
+        Voxels of probability `full`, in [0.01, 1], or more count as occupied.
         """
         device, occupancy = occupancy.origin.device, settle(occupancy, torch.device("cpu"))  # SciPy's distances
         probability, levels = occupancy.probability, sorted({0.1, 0.5, 0.8, full})
@@ -94,10 +91,8 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 class CollisionWorld(Value):
     """The surroundings that a hand must not touch: the object's signed distance `field`, a table, and obstacles.
 
-    The table is a plane, or a height [m] along z. A part of the surroundings that does not exist is None.
-
-    Raises:
-        BadArgument: a table that is neither a plane nor a height.
+    The table is a plane, or a height [m] along z. A part of the surroundings that does not exist is None. Raises
+    `BadArgument` for a table that is neither a plane nor a height.
 
     >>> CollisionWorld(table=0.02).plane.offset
     0.02

@@ -115,11 +115,9 @@ def nearest_postures(
 
     Each contact set has at most `n_seeds` seeds, best first, or none if its contacts lie on a line. The seeds are in
     the order of the contact sets; Eq. (24) gives their poses. `energy` is half the squared distance between the
-    features of posture and contacts. If the arm cannot reach a pose, the next posture takes its place.
-
-    Raises:
-        BadArgument: `n_seeds` is not in [1, 64], or above six times the number of postures; contacts are on another
-            device than the library, or their number in a set is not that of the hand's fingertips.
+    features of posture and contacts. If the arm cannot reach a pose, the next posture takes its place. Raises
+    `BadArgument` for `n_seeds` that are not in [1, 64], or above six times the number of postures. Contacts on another
+    device than the library, or of another number than fingertips, are refused, too.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -70,7 +70,9 @@ def solve_ik(
 ) -> IKSolution:
     """Return hand configurations that touch given contacts, in any assignment to fingers, without self-collision.
 
-    All arguments are moved to the contacts' device.
+    All arguments are moved to the contacts' device. Raises `BadArgument` for contacts that are not finite, or not one
+    for each fingertip, a mixture of another hand, or an unknown method. For more than three fingertips it refuses a
+    mixture and COBYLA.
 
     Args:
         contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not used.
@@ -83,10 +85,6 @@ def solve_ik(
     Returns:
         The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of its contact, every
         contact direction is inside its pad's cone, and every link is clear.
-
-    Raises:
-        BadArgument: contacts that are not finite, or not one for each fingertip; a mixture of another hand, an unknown
-            method; a mixture or COBYLA for more than three fingertips.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> points = 0.05 * torch.eye(3)[None].double()

@@ -179,7 +179,8 @@ def closure_probability(
 ) -> ClosureProbability:
     """Return the probability that each contact set has force closure on the uncertain surface, by Monte Carlo.
 
-    All contact sets share the random surfaces, and no result depends on another set.
+    All contact sets share the random surfaces, and no result depends on another set. Raises `BadArgument` for a wrong
+    argument, or a contact that is not finite or outside the shape's domain.
 
     Args:
         shape: the uncertain shape.
@@ -189,9 +190,6 @@ def closure_probability(
         n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is computed for
             the fraction (k + 1) / (n + 2) if k draws have force closure, and so never 0.
         seed: random seed.
-
-    Raises:
-        BadArgument: a wrong argument, or a contact that is not finite or outside the shape's domain.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -39,7 +39,8 @@ def plan_contacts(
 
     A failed set carries the `Status` of the first constraint that it violates. If the solver fails from a feasible
     initial guess, the guess itself is the result. Without `time_budget` the result is deterministic, and the sets from
-    500 or 1000 initial guesses are the first sets of a plan from more.
+    500 or 1000 initial guesses are the first sets of a plan from more. Raises `BadArgument` for `starts` that are not
+    positive, of a wrong shape, or outside the shape's domain, or another wrong argument.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
@@ -47,9 +48,6 @@ def plan_contacts(
         starts: number of random initial guesses (Sec. 6.2), or the initial contact points [m].
         seed: random seed.
         time_budget: wall time [s] of the call, in which at least 25 starts are planned; by default all are planned.
-
-    Raises:
-        BadArgument: `starts` not positive, of a wrong shape, or outside the shape's domain, or another wrong argument.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)

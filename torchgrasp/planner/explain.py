@@ -187,7 +187,7 @@ def explain_empty(
     The work is bounded, not the time, so that a seed always gives the same explanation. A plan has at most 20 initial
     guesses and a small library of postures. Relaxed constraints are tried only where no contact set is found. At most
     eight changes are tried, in the order of the losses that they could prevent; fewer with "auto" fingers. If no change
-    helps, a request of at most 80 guesses is tried with four times as many.
+    helps, a request of at most 80 guesses is tried with four times as many. Raises the errors of `plan_grasps`.
 
     Args:
         cloud, hand, spec, starts, seed: as in `plan_grasps`.
@@ -196,9 +196,6 @@ def explain_empty(
 
     Returns:
         The explanation; `print` shows it.
-
-    Raises:
-        BadArgument: as `plan_grasps`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)

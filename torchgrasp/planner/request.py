@@ -98,11 +98,9 @@ class Request:
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
     """Return one hand for each set of fingers to plan with.
 
-    "auto" gives all sets that the hand declares; a name or number gives that set; None gives the hand as it is.
-
-    Raises:
-        BadArgument: fingers that the hand does not have; more than three fingers, or "auto", in a mode other than
-            "joint".
+    "auto" gives all sets that the hand declares; a name or number gives that set; None gives the hand as it is. Raises
+    `BadArgument` for fingers that the hand does not have, and for more than three fingers, or "auto", in a mode other
+    than "joint".
     """
     if fingers == "auto":
         if mode != "joint":

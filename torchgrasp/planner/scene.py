@@ -84,7 +84,8 @@ def plan_scene(
 
     Nothing is planned for an object if its image shows that it cannot be grasped (`Status.FEW_PIXELS` to `TOO_VAGUE`).
     Of the other objects, near and tall ones with free space around them are planned first. Objects that are larger than
-    all objects in our trials, or cut off by the image border, are planned last.
+    all objects in our trials, or cut off by the image border, are planned last. Raises `BadArgument` for a scene
+    without objects, or an argument of the wrong type or range.
 
     Args:
         scene: objects on a table.
@@ -95,9 +96,6 @@ def plan_scene(
         fingers: see `plan_grasps`; "auto" chooses fingers for each object. `hand_of` loads the hand of grasps.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.
         reachable, task, promise: see `plan_grasps`.
-
-    Raises:
-        BadArgument: a scene without objects, or an argument of the wrong type or range.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)

@@ -101,7 +101,9 @@ def fit_mixture(
 
     The mixture's `meta` reports iterations, convergence, collapsed components, mean log-likelihood and the Bayesian
     information criterion (BIC). Codes are exact functions of the joints, so the BIC keeps falling with more components:
-    use its elbow, not its minimum.
+    use its elbow, not its minimum. Raises `BadArgument` for too few samples, a joint that does not vary, a number out
+    of range, or another fit's checkpoint. A checkpoint that is damaged or cannot be written is a `ModelFileError` or
+    `OutputError`. A component that collapsed more than three times is an `IndefiniteCovariance`.
 
     Args:
         samples: joints [rad] and fingertip codes of postures of one hand.
@@ -116,11 +118,6 @@ def fit_mixture(
         checkpoint: file that stores the fit after every step. A fit that continues from it gives the same bits.
         distributed: whether `samples` are only the part of this process under torchrun. All processes must see the same
             checkpoint.
-
-    Raises:
-        BadArgument: too few samples, a joint that does not vary, a number out of range, or another fit's checkpoint.
-        ModelFileError, OutputError: a damaged checkpoint, or one that cannot be written.
-        IndefiniteCovariance: a component collapsed more than three times.
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))

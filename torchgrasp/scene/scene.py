@@ -124,6 +124,9 @@ class Scene(Value):
     ) -> "Scene":
         """Return the scene in a cloud of one view, projected to a pinhole image at its viewpoint.
 
+        Raises `BadArgument` for no viewpoint, or several, and labels or a mask of another size, and the errors of
+        `from_depth`.
+
         Args:
             cloud: everything that the camera saw [m], with its viewpoint.
             labels: (n,) of whole numbers; 0 means no object.
@@ -131,10 +134,6 @@ class Scene(Value):
             box: two corners (2, 3) [m] of a box along the axes, which holds the target.
             point: a point (x, y, z) [m] of the target.
             table, up: as in `from_depth`.
-
-        Raises:
-            BadArgument: no viewpoint, or several; labels or mask of another size; and as `from_depth`.
-            NoSupport: no plane is found on which objects stand.
 
         >>> from torchgrasp import PointCloud, load_scene
         >>> seen = load_scene()

@@ -196,6 +196,8 @@ def condition(
 
     The posterior is differentiable, to any order, in all tensors of the observations, in the frame's centre and in
     tensors that the kernel's profile uses. The length psi of a kernel by name and the domain's radius are constants.
+    Raises `BadArgument` for an unknown kernel or points inside torch.vmap, and `IndefiniteCovariance` if psi is too
+    small for these observations.
 
     Args:
         observations: signed distances and normals at points, with their noise, all normalised. torch.vmap may map over
@@ -206,10 +208,6 @@ def condition(
             makes the covariance indefinite.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
         kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
-
-    Raises:
-        BadArgument: an unknown kernel; points inside torch.vmap.
-        IndefiniteCovariance: psi is too small for these observations.
 
     >>> x, noise = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2, torch.full((6,), 0.01).double()
     >>> seen = Observations(x, 0 * noise, 2 * x, noise > 0, noise, noise)

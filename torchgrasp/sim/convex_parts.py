@@ -31,11 +31,8 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     """Return convex parts that together fill a closed mesh; a single part if the mesh is convex.
 
     The parts are cached in the folder `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. If the
-    folder cannot be written, a warning is logged.
-
-    Raises:
-        MeshError, SuspiciousScale: as raised by `read_mesh`; also a mesh that takes too much time or memory to cut.
-        MissingExtra: the mesh is not convex and CoACD is not installed.
+    folder cannot be written, a warning is logged. Raises the errors of `read_mesh`, and `MeshError` for a mesh that
+    takes too much time or memory to cut. Without CoACD a mesh that is not convex raises `MissingExtra`.
 
     >>> import trimesh
     >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))

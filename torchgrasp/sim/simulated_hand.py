@@ -18,10 +18,8 @@ from torchgrasp.specs import Simulator
 def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> Scene:
     """Return a fresh scene of a simulator, at its initial state.
 
-    Raises:
-        BadArgument: an unknown simulator, or a joint of the hand without a position or drive.
-        HandFileError: the hand's URDF is not valid.
-        MissingExtra: the simulator is not installed.
+    Raises `BadArgument` for an unknown simulator, or a joint of the hand without a position or drive. A bad URDF is a
+    `HandFileError`, a simulator that is not installed a `MissingExtra`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand = load_object("jug"), load_hand("barrett")

@@ -28,7 +28,9 @@ class WarpScenes:
     """Simulated scenes of one hand, each with its own object and poses, which all advance at once.
 
     Each scene is the model that `MujocoScene` simulates. All are padded to the same number of convex parts: MuJoCo Warp
-    skips a part without a mesh. World c n + k of c copies of n scenes is a copy of scene k.
+    skips a part without a mesh. World c n + k of c copies of n scenes is a copy of scene k. Raises `BadArgument` for a
+    table or neighbours, or a device that Warp does not find, `MissingExtra` without MuJoCo Warp, and the errors of
+    `open_scene`.
 
     Attributes:
         overlap: the hand's penetration depth (n,) [m] at the start, as from MuJoCo.
@@ -37,10 +39,6 @@ class WarpScenes:
     Args:
         specs: parameters of the n scenes, which differ in object, friction, and joints and pose of the hand.
         device: Warp's name of the device, as "cuda" or "cpu".
-
-    Raises:
-        BadArgument: a table or neighbours, or a device that Warp does not find.
-        HandFileError, MissingExtra: as `open_scene`; also MuJoCo Warp is not installed.
     """
 
     def __init__(self, specs: Sequence[SceneSpec], device: str) -> None:
