@@ -74,3 +74,18 @@ def test_rows_that_are_solved_or_hold_no_number_are_left_alone(generator, value)
     found = solve(start)
     torch.testing.assert_close(found[2], start[2], rtol=0, atol=0, equal_nan=True)
     torch.testing.assert_close(found[[0, 1, 3]], torch.ones(3, 2, dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+def test_the_step_of_a_row_that_has_ended_is_zero_even_if_its_matrix_factors(generator, monkeypatch):
+    """A GPU factors a matrix with an infinite diagonal without complaint, and its step is NaN."""
+
+    def factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
+        return matrix, torch.zeros(len(matrix), dtype=torch.int32)
+
+    monkeypatch.setattr("torch.linalg.cholesky_ex", factor)
+    problem = LeastSquares(rosenbrock, lambda state, x: Point(state.x + x))
+    state = Point(torch.cat([torch.ones(1, 2, dtype=torch.float64), starts(generator, 2)]))
+    model = problem.linearise(state, torch.arange(3))
+    step, goes_on = problem.step(model, torch.tensor([1e-2, torch.inf, 1e-2], dtype=torch.float64))
+    assert goes_on.tolist() == [False, False, True]
+    assert torch.equal(step[:2], torch.zeros(2, 2, dtype=torch.float64)) and bool(step[2].abs().gt(0).any())

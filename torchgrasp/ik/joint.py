@@ -159,8 +159,7 @@ def solve_sliding(
     joint_problem: JointProblem, problem: GraspProblem, seeds: IKSeeds, attempts: Attempts[Grasps]
 ) -> None:
     """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps to `attempts`."""
-    count = 8 if len(problem.hand.tips) == 3 else 2
-    chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, count)
+    chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, 2)  # of more, few find another grasp
     size = min(at_once(chosen.row, 512), 2**15)  # the Jacobians of more do not fit into an accelerator
     for part in (chosen[k : k + size] for k in range(0, len(chosen), size)):
         own = joint_problem.rows(part.row)
