@@ -59,8 +59,7 @@ class PointCloud(Value):
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
         """Return a cloud of some of the points, with their normals and viewpoints.
 
-        Args:
-            rows: a mask, or indices in the wanted order.
+        The `rows` are a mask, or indices in the wanted order.
         """
         normals, eye, frustum = self.normals, self.viewpoint, self.frustum
         chosen = read_rows(rows, len(self))

@@ -54,13 +54,9 @@ def diagnose_cloud(
 
     In a large cloud, 50 000 points are measured; 5000 of them serve the advice on camera, vertical, table and bodies.
 
-    Args:
-        cloud: points of one object [m].
-        up: vector of any length that points up; None for z, unless the cloud seems to be in its camera's frame.
-        table: plane of the table; None if the table is assumed at the lowest point.
-        stands: whether the object stands on a table; else the camera may be below it.
-
-    Raises the errors of `check_cloud`, and `BadArgument` for a vertical of length zero.
+    `up` is a vector of any length that points up; None means z, unless the cloud seems to be in its camera's frame.
+    Without a `table` it is assumed at the lowest point. If the object stands on none (`stands`), the camera may
+    be below it. Raises the errors of `check_cloud`, and `BadArgument` for a vertical of length zero.
 
     >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
     0

@@ -156,13 +156,10 @@ def merge_clouds(
     """Return one cloud of several views in a common frame, with the normal and the camera position of each point.
 
     `estimate_normals` gives normals to a view without normals. A view with normals but without viewpoint leaves the
-    result without viewpoint. Points are denser where views overlap; `voxel_downsample` evens the density. Raises
-    `BadArgument` for no cloud, another number of poses, a pose that is not rigid, or clouds of several dtypes or
-    devices. The views and the result may raise the errors of `check_cloud`.
-
-    Args:
-        clouds: points [m] of the views, each in its own frame.
-        poses: rigid transform obj_from_cloud (4, 4) of each view.
+    result without viewpoint. Points are denser where views overlap; `voxel_downsample` evens the density. The rigid
+    `poses` obj_from_cloud (4, 4) [m] lead from the frames of the views. Raises `BadArgument` for no cloud, another
+    number of poses, a pose that is not rigid, or clouds of several dtypes or devices. The views and the result may
+    raise the errors of `check_cloud`.
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))

@@ -120,12 +120,8 @@ def cloud_from_array(
 ) -> PointCloud:
     """Return a cloud made of NumPy arrays [m]; points that were not measured, and colours, are left out.
 
-    Args:
-        points: (n, 3), or (h, w, 3) for an image; or with six columns, of which the last three are normals.
-        normals: outward normals, of the same shape as points, or None.
-        viewpoint: the camera's position (3,), or None.
-
-    Raises the errors of `check_cloud`.
+    `points` are (n, 3), or (h, w, 3) for an image; or have six columns, of which the last three are normals. `normals`
+    have the shape of the points. Raises the errors of `check_cloud`.
 
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
     48

@@ -159,10 +159,8 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
 
     Pixels that most frames miss (0, NaN or infinity) are 0. The unit is that of the frames.
 
-    Args:
-        frames: images (h, w) of one size and one dtype.
-
-    Raises `BadArgument` for no frame, for frames of several sizes or dtypes, or if camera or scene have moved in one.
+    The `frames` are images (h, w) of one size and one dtype. Raises `BadArgument` for no frame, for frames of several
+    sizes or dtypes, or if camera or scene have moved in one.
 
     >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
     tensor([[0.0000, 0.7010]])

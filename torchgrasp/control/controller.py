@@ -141,10 +141,8 @@ class GraspController:
 
         The palm does not rotate, so the contacts of a turned object are found by touch.
 
-        Args:
-            cloud: points [m] of the object alone, in the frame of the grasp.
-
-        Raises `BadArgument` if the hand has no approach, or has begun it.
+        The `cloud` has points [m] of the object alone, in the frame of the grasp. Raises `BadArgument` if the hand has
+        no approach, or has begun it.
         """
         reference = self.planned
         if self.guard is None or self.guard.left < self.guard.length:

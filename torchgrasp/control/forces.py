@@ -52,14 +52,9 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
     The targets solve J^T f = kp (target - q) for the `desired_forces` f. They may exceed a joint's limits. They are
     differentiable in the joints of the grasps; the forces, found by a search, are not differentiable in the contacts.
 
-    Args:
-        hand: the hand; it follows the grasps to their device.
-        grasps: g grasps, planned for this hand.
-        force: normal force of the strongest finger [N].
-        kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
-
-    Raises `BadArgument` for joints or fingers of another hand, a force or stiffness that is not positive, contacts or
-    poses by which derivatives are taken.
+    `force` [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of every joint's drive, by
+    default the hand's own. The hand follows the grasps to their device. Raises `BadArgument` for joints or fingers of
+    another hand, a force or stiffness that is not positive, contacts or poses by which derivatives are taken.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -21,12 +21,8 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
 
     The motion minimises the sum of log(1 + (d_i / s)^2), with the signed distances d_i of the new points from the moved
     surface and s = 4 mm (Cauchy's cost, which outliers hardly move). A grid search to 80 mm and 30 degrees starts
-    Gauss-Newton steps.
-
-    Args:
-        surface: signed distances from the estimated surface (`surface_field`).
-        cloud: a new view of the object [m], in the frame of the surface.
-        table: the table in this frame.
+    Gauss-Newton steps. The `surface` (`surface_field`), a new `cloud` of the object [m] and the `table` are in one
+    frame.
     """
     most, best, steps = 300, 16, 20  # points of the cloud, places of the grid, and steps from each of them
     rows = torch.linspace(0, len(cloud) - 1, min(len(cloud), most)).round().long()

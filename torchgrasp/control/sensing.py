@@ -122,9 +122,7 @@ class DriveFeel:
 class FingertipSensor:
     """Simulate the fingertip sensors that a `SensorModel` describes: a call takes true contacts, and returns readings.
 
-    Args:
-        reference: the closing plan, with the sensor model.
-        generator: draws the noise; without one there is no noise.
+    The closing plan has the sensor model. The `generator` draws the noise; without one there is no noise.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

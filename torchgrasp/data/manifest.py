@@ -91,14 +91,9 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
 
     Each mesh is moved so that its lowest point is at z = 0 and the middle of its box above the origin. Each view is
     rendered by the depth camera of `partial_view` from a random side. The manifest is written last, so that a folder
-    with a manifest is complete. Raises `DatasetError` for no meshes or two meshes of one name, the errors of
-    `read_mesh`, and `OutputError` if the folder cannot be written.
-
-    Args:
-        meshes: folder of closed meshes [m], z up (.ply, .stl, .obj, .off).
-        out: folder to write.
-        views: number of views of each object.
-        seed: random seed of cameras and noise.
+    with a manifest is complete. The `meshes` are closed, in metres, with z up (.ply, .stl, .obj, .off). Raises
+    `DatasetError` for no meshes or two meshes of one name, the errors of `read_mesh`, and `OutputError` if the folder
+    cannot be written.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

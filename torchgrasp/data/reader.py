@@ -123,12 +123,8 @@ def shard_path(folder: Path, k: int) -> Path:
 def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     """Open a data set that a campaign has written; shards are read on demand.
 
+    Of each cloud `points` points are drawn, the same in every call; a smaller cloud repeats points. None means all.
     Raises `ModelFileError` if the campaign is not finished, or its card is damaged.
-
-    Args:
-        folder: folder of the data set.
-        points: number of points that are drawn from each cloud, equal in every call; a smaller cloud repeats points.
-            None means all points.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand

@@ -71,9 +71,7 @@ def load_object(name: str) -> GraspObject:
 def load_shipped_grasp(name: str, hand: str) -> Grasps:
     """Return a shipped grasp of a shipped object, to close or draw at once; raise `BadArgument` for an unknown one.
 
-    Args:
-        name: "cylinder" or "jug".
-        hand: "allegro" or "barrett".
+    The objects are "cylinder" and "jug", the hands "allegro" and "barrett".
 
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> grasp.joints.shape, grasp.certificate.closed

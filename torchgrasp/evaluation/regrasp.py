@@ -85,12 +85,8 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
     withdraws. The object stays where it then is. The robot expects it where the touches of the last try tell, or looks
     once more, and tries the grasp of `next_grasp`.
 
-    Args:
-        trial: the trial, with grasps in the order of preference; the truth's `error` is that of the first grasp.
-        spec: parameters of the trial; `TrialSpec()` by default.
-        tries: largest number of grasps to try; with one the trial is that of `close_hand`.
-
-    Raises the errors of `close_hand`.
+    The trial's grasps are in the order of preference; the truth's `error` is that of the first grasp. With one of the
+    `tries` the trial is that of `close_hand`. Raises the errors of `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -33,11 +33,8 @@ LEAST_TILT = 0.05  # least sine of the angle between the vertical and a camera t
 class Plane(Value):
     """A table plane: the points p with normal . p = offset. Objects stand on the side of the normal.
 
-    Args:
-        normal: unit vector that points up.
-        offset: distance [m] of the plane from the origin along the normal.
-
-    Raises `BadArgument` if the normal is not of unit length, or a number is not finite.
+    The unit `normal` points up; `offset` is the distance [m] of the plane from the origin along it. Raises
+    `BadArgument` if the normal is not of unit length, or a number is not finite.
 
     >>> plane = Plane.horizontal(0.1)
     >>> plane.describe(), plane.height(torch.tensor([0.0, 0.0, 0.3]))

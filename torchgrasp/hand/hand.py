@@ -247,11 +247,8 @@ class Hand(Value):
         """Return the least signed separation [m] of the link pairs in hand.toml. It is negative if links overlap.
 
         A negative value is minus the shortest translation that separates two links. A positive value is a lower bound
-        of the distance, exact where a face is nearest.
-
-        Args:
-            below: separations above this value [m] may be inexact lower bounds, which is faster.
-            chunk: number of postures computed at a time, which bounds the memory.
+        of the distance, exact where a face is nearest. Separations above `below` [m] may be inexact lower bounds, which
+        is faster. `chunk` postures are computed at a time, which bounds the memory.
         """
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])

@@ -102,11 +102,9 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
 def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     """Return the hand with the fingers for which grasps were planned.
 
-    Args:
-        grasps: grasps of `plan_grasps`, also loaded from a file.
-        hand: the same hand with any fingers, its name or its folder; by default the shipped hand that the grasps name.
-
-    Raises the errors of `load_hand`, and `BadArgument` for grasps that name no hand, another hand, or unknown fingers.
+    `grasps` may be loaded from a file. `hand` is the same hand with any fingers, its name or its folder; by default the
+    shipped hand that the grasps name. Raises the errors of `load_hand`, and `BadArgument` for grasps that name no hand,
+    another hand, or unknown fingers.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand_of(load_shipped_grasp("jug", "barrett")).name

@@ -46,12 +46,9 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
     The margin is differentiable once in points and normals. Where several phi or v are optimal, its derivative is that
     of one of them; where the margin is -inf, its derivative is NaN. A second derivative, and one of another field,
-    raise `BadArgument`; in forward mode the latter is NaN. Raises `BadArgument` for contacts of a wrong shape, normals
-    that are not of length 1 (to 1e-3), or no `ContactSpec`.
-
-    Args:
-        contacts: sets of three to five contacts with outward unit normals, from any planner.
-        spec: friction and edges; `ContactSpec()` by default.
+    raise `BadArgument`; in forward mode the latter is NaN. The `contacts` are sets of three to five with outward unit
+    normals, from any planner. Raises `BadArgument` for contacts of a wrong shape, normals that are not of length 1 (to
+    1e-3), or no `ContactSpec`.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners)).closed

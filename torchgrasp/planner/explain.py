@@ -194,9 +194,6 @@ def explain_empty(
         options: the further arguments of `plan_grasps`. The `observer` is called with "funnel" and the `Funnel` of the
             first plan, then with "change" and the `Trial` of each change. No change begins after `time_budget`.
 
-    Returns:
-        The explanation; `print` shows it.
-
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)
     >>> explanation = explain_empty(load_object("cylinder").view, load_hand("barrett"), spec, starts=20)

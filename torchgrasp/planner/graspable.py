@@ -27,11 +27,6 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
 
     The objects are judged from the depth image alone, without planning, in milliseconds.
 
-    Args:
-        scene: objects on a table.
-        hand: from `load_hand`.
-        spec: the constraints on contacts; `ContactSpec()` by default.
-
     >>> from torchgrasp import load_hand, load_scene
     >>> set(judge_things(load_scene(), load_hand("barrett")).values()) == {Status.OK}
     True

@@ -122,14 +122,8 @@ def stream_grasps(
 
     Each grasp has force closure, has passed all checks, and is scored. All batches together, ranked, are the executable
     grasps of `plan_grasps` with the same arguments. The work stops when the caller stops iterating. In modes other than
-    "joint", and with "auto" fingers, there is one batch. Raises the errors of `plan_grasps`; for a wrong cloud at the
-    first iteration.
-
-    Args:
-        cloud: this and all other arguments: see `plan_grasps`.
-
-    Returns:
-        An iterator over `Grasps` of at least one grasp each. A later batch may have a better best grasp.
+    "joint", and with "auto" fingers, there is one batch. Each batch has at least one grasp; a later one may have a
+    better best grasp. Raises the errors of `plan_grasps`; for a wrong cloud at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object
     >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=40))

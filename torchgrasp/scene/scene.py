@@ -180,10 +180,8 @@ class Scene(Value):
     def select(self, target: int | Sequence[float | int] | Tensor | np.ndarray) -> "Scene":
         """Return the scene with another target.
 
-        Args:
-            target: a label, a pixel (u, v) of the image, or a point (x, y, z) [m].
-
-        Raises `BadArgument` for no such label, for a place where nothing was measured, or for a place on the table.
+        The target is a label, a pixel (u, v) of the image, or a point (x, y, z) [m]. Raises `BadArgument` for no such
+        label, for a place where nothing was measured, or for a place on the table.
         """
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:

@@ -26,10 +26,8 @@ class HollowShape(ShapeGP):
     """The shape of an open vessel: the material between an outer and an inner surface, each a Gaussian process.
 
     A single smooth field cannot change its sign twice within a thin wall. At every point the surface with the greater
-    mean distance gives distance, normal and covariance. Errors of the two surfaces are independent.
-
-    Args:
-        inner: the inner surface; its signed distance is positive in the vessel's cavity and negative around the cavity.
+    mean distance gives distance, normal and covariance. Errors of the two surfaces are independent. The signed distance
+    of the `inner` surface is positive in the vessel's cavity and negative around the cavity.
 
     >>> import trimesh
     >>> from torchgrasp import fit_shape

@@ -32,10 +32,8 @@ SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z"
 class Neighbour:
     """Another body on the simulated table, beside the object to grasp.
 
-    Args:
-        mesh: closed mesh [m] in the frame of the grasp.
-        parts: convex bodies that make up the mesh; by default `convex_parts` of the mesh.
-        mass: mass [kg]; by default from `TrialSpec.mass` or `TrialSpec.density`, as for the object.
+    The closed `mesh` [m] is in the frame of the grasp. `parts` are by default its `convex_parts`, and the `mass` [kg]
+    follows from `TrialSpec.mass` or `TrialSpec.density`, as for the object.
     """
 
     mesh: "trimesh.Trimesh"

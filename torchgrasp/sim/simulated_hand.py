@@ -45,13 +45,8 @@ class SimulatedHand:
     counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before it.
     Three attributes are about the hand's other contacts, with entries for neighbours, table top and target, in this
     order: `first_stray` is the step of the first contact, `stray` the sum of the impulses [N s], `most_stray` the
-    largest force [N] over a tick.
-
-    Args:
-        scene: a scene at its initial state.
-        reference: the closing plan.
-        control_rate: rate of control ticks [Hz].
-        generator: draws the noise of the fingertips; without one there is no noise.
+    largest force [N] over a tick. The scene is at its initial state. `control_rate` [Hz] is the rate of ticks. The
+    generator draws the noise of the fingertips; without one there is no noise.
     """
 
     def __init__(

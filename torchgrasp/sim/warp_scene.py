@@ -28,17 +28,10 @@ class WarpScenes:
     """Simulated scenes of one hand, each with its own object and poses, which all advance at once.
 
     Each scene is the model that `MujocoScene` simulates. All are padded to the same number of convex parts: MuJoCo Warp
-    skips a part without a mesh. World c n + k of c copies of n scenes is a copy of scene k. Raises `BadArgument` for a
-    table or neighbours, or a device that Warp does not find, `MissingExtra` without MuJoCo Warp, and the errors of
-    `open_scene`.
-
-    Attributes:
-        overlap: the hand's penetration depth (n,) [m] at the start, as from MuJoCo.
-        joint_names: names of the driven joints.
-
-    Args:
-        specs: parameters of the n scenes, which differ in object, friction, and joints and pose of the hand.
-        device: Warp's name of the device, as "cuda" or "cpu".
+    skips a part without a mesh. World c n + k of c copies of n scenes is a copy of scene k. `overlap` is the hand's
+    penetration depth (n,) [m] at the start, as from MuJoCo. The n `specs` differ in object, friction, and joints and
+    pose of the hand. The `device` is Warp's, as "cuda" or "cpu". Raises `BadArgument` for a table or neighbours, or a
+    device that Warp does not find, `MissingExtra` without MuJoCo Warp, and the errors of `open_scene`.
     """
 
     def __init__(self, specs: Sequence[SceneSpec], device: str) -> None:

@@ -41,12 +41,8 @@ def explain_success(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask 
 
     The cost of a cause is what the log-odds of success gain if its `CAUSES` take their median among grasps that held.
 
-    Args:
-        grasps: from `plan_grasps`, with the hand; at least one.
-        shape: the estimated shape, in the frame of the grasps.
-        task: the task of the grasps; by default `GraspTask()`.
-
-    Raises `BadArgument` for no grasps, or grasps of another planner.
+    The `shape` is in the frame of the grasps. The `task` is by default `GraspTask()`. Raises `BadArgument` for no
+    grasps, or grasps of another planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

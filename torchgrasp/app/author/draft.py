@@ -62,13 +62,11 @@ class Wish(NamedTuple):
 def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: Seed = 0) -> str:
     """Return the text of a hand.toml for a clean URDF, to be reviewed by the user and checked by `check_hand`.
 
-    Raises `HandFileError` for a URDF that is missing or malformed, or needs repair by `new_hand`. Raises `BadArgument`
-    for fewer than three tips, more than five, or a tip without a collision shape or a movable joint.
-
-    Args:
-        tips: links of the fingertips in grasp order, first the three of option "default"; "four" and "five" add the
-            next tips. By default the last links of the branches, in the order in which their pads best face each other.
-        name: name of the hand; by default the name of the robot.
+    `tips` are the links of the fingertips in grasp order, first the three of option "default"; "four" and "five" add
+    the next ones. By default they are the last links of the branches, in the order in which their pads best face each
+    other. The hand has the `name` of the robot by default. Raises `HandFileError` for a URDF that is missing or
+    malformed, or needs repair by `new_hand`. Raises `BadArgument` for fewer than three tips, more than five, or a tip
+    without a collision shape or a movable joint.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")
