@@ -13,7 +13,6 @@ from torchgrasp.geometry.plane import Plane, as_plane
 
 Simulator = Literal["sapien", "mujoco"]
 """The simulators."""
-
 TIP_RADIUS, SEPARATION = 0.012, 0.026
 """Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind smaller fingertips."""
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
@@ -156,10 +155,8 @@ Mode = Literal["joint", "contact_first", "paper"]
 """
 Ranking = Literal["success", "variance"]
 """Which grasp is the best: the one with the highest predicted success, or the least sum of variances (the paper's)."""
-
 ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper", "uncertainty"]
 """How a hand closes; `TrialSpec` explains the modes."""
-
 HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
 """How a closed hand presses; `TrialSpec` explains the modes."""
 

@@ -19,7 +19,6 @@ ROUNDS = 3
 """How often a job whose process died is tried in one call, because a dying process also ends jobs beside its own."""
 FAILED = (Status.WORKER_DIED, Status.TIMED_OUT, Status.BROKEN)
 """Statuses of a failed job that say nothing about its object: the next call tries the job again."""
-
 Work = Callable[[Sequence[int]], Generator[tuple[int, bytes | Status], None, None]]
 """Function of job indices that yields, as each job ends, a position in these indices, and a file or a failure."""
 FIELDS = (

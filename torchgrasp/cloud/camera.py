@@ -19,7 +19,6 @@ from torchgrasp.lazy import trimesh
 from torchgrasp.values import PointCloud
 
 Transform = Float[Tensor, "4 4"]
-
 WIDTH, HEIGHT, FOCAL = 640, 480, 616.0  # columns, rows and focal length [px] of the default camera
 INTRINSICS = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64)
 """Intrinsics [px] of the default camera."""

@@ -56,7 +56,6 @@ class SensorNoise(Value):
 
 ACTIVE_STEREO = SensorNoise(base=616.0 * 0.055, disparity=0.12, step=1 / 32)
 """Noise of an active stereo camera with a baseline of 55 mm and independent pixels; `noise=True` selects it."""
-
 SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType({
     # Intel's tuning guide of the D400: about 0.08 px of subpixel noise, 50 mm baseline; patches as in public frames.
     "realsense": SensorNoise(30.8, 0.08, 1 / 32, grain=5.0, bias=0.0015, bias_width=18.0, shadow=True),

@@ -29,10 +29,8 @@ from torchgrasp.values import PointCloud
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Function of an observation and the time [s] to the next tick, which returns the targets [rad] of all joints."""
-
 Closing = OpenLoopClosing | PositionClosing | PaperClosing | UncertaintyClosing
 Period = Annotated[float, Range(1e-5, 1.0)]
-
 CLOSING_TIME = 4.0  # longest time [s] of closing before the hand presses with the contacts that it has
 
 

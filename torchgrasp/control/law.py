@@ -12,10 +12,8 @@ from torchgrasp.geometry.linalg import cholesky, limit_norm, squared_mahalanobis
 Vectors = Float[Tensor, "*b 3"]
 Numbers = Float[Tensor, "*b"]
 Matrices = Float[Tensor, "*b 3 3"]
-
 POSITION_FLOOR = 0.005
 """Standard deviation [m], in all directions, of errors of hand pose and joint zeros; it keeps Eq. (27) finite."""
-
 POSITION_RATE = 4.0  # largest position gain [1/s]: alpha_p = POSITION_RATE * POSITION_FLOOR**2
 FORCE_BANDWIDTH = 15.0  # bandwidth [rad/s] of the most certain force loop; the lag of the sensor's filter bounds it
 FORCE_FLOOR = 0.3  # isotropic standard deviation [N] of Sigma_fd: the tactile sensor's noise along the surface

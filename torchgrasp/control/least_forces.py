@@ -20,7 +20,6 @@ from jaxtyping import Bool, Float
 from torchgrasp.plan.forces import grasp_map
 
 Array = np.ndarray
-
 PENALTY, KNEE = 500.0, 0.9
 """Weight [N] of the penalty on joint torques and normal forces, and the share of their limits where it begins."""
 

@@ -18,7 +18,6 @@ from torchgrasp.geometry.linalg import across, unit
 
 TURNS, FINE_TURNS = (-0.24, -0.12, 0.0, 0.12, 0.24), (-0.06, 0.0, 0.06)
 """Turns [rad] of the object that `Localization` tries, and turns about the best of them."""
-
 PITCH, FARTHEST = 0.006, 0.072  # distance [m] between the displacements that `Localization` tries, and the largest
 
 

@@ -25,7 +25,6 @@ SPEED, ACCELERATION = 0.1, 1.0  # largest speed [m/s] of the approach, and its a
 PRESSING_TIME = 0.5  # time [s] from the end of closing until the hand counts as closed, and is judged
 MISPLACED = 0.008
 """Distance [m] between the displacements of object and palm from which the hand opens: twice the estimate's error."""
-
 OPENING_TIME = 0.5  # time [s] in which the fingers open
 
 

@@ -29,7 +29,6 @@ from torchgrasp.errors import BadArgument
 
 WAITING_FORCE = 0.3
 """Largest force [N] of a finger that waits until the others touch, and the reading that stands for a binary contact."""
-
 TORQUE_NOISE = 0.01  # standard deviation [N m] of a sensed joint torque
 
 

@@ -107,11 +107,8 @@ _FLOATING = TrialSpec(
     gravity=0.0, table=False, approach=0.0, lift_height=0.0,
 )  # fmt: skip
 """DexGraspBench's trial. PhysX resists torsion by friction x force x patch: torsional over sliding friction [m]."""
-
 _PULL = PullSpec(10.0, 2.0, 0.05, math.radians(15))  # DexGraspBench's
-
 POSE_NOISE = PoseNoise(0.005, math.radians(5))  # as large as in Get a Grip (CoRL 2024)
-
 PROTOCOLS = {
     protocol.name: protocol
     for protocol in (

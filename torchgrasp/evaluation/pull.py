@@ -22,7 +22,6 @@ from torchgrasp.threads import single_threaded
 
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """Directions of the pulls: -x, +x, -y, +y, -z, +z of the world."""
-
 INTERVAL = 0.2  # interval [s] at which the pulled object's motion is checked
 
 

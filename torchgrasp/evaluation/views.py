@@ -39,7 +39,6 @@ from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
-
 Ranks = Literal["best", "spread"]
 """Which grasps of a view are tried: the best grasps, or the same number of grasps spread over all ranks."""
 

@@ -26,7 +26,6 @@ from torchgrasp.limits import JSON_BYTES, JSON_LETTERS, LARGEST_NUMBER, SHOWN_LE
 
 Item = TypeVar("Item")
 SomeValue = TypeVar("SomeValue", bound=Value)
-
 VERSION = "1"  # version of the file layout; readers refuse all others
 DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)  # dtypes in our files
 

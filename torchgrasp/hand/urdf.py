@@ -23,7 +23,6 @@ from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
 REPAIR = "(torchgrasp hand new writes a clean copy)"
 """The end of an error about a published URDF that the library cannot use as it is."""
-
 Triple = tuple[float, float, float]
 
 

@@ -25,7 +25,6 @@ from torchgrasp.values import Contacts, IKSeeds
 
 Wanted = Float[Tensor, "r p d"]
 Given = Float[Tensor, "s d"]
-
 LENGTH_SCALE, COSINE_SCALE = 0.01, 0.5  # distances of tip centres [m] and of pad axes that count the same
 CANDIDATES = 64  # nearest postures of a row whose clearances are measured; also the most seeds of a row
 ASSIGNMENTS = 6  # assignments of contacts to fingers in which a row is compared with the whole library

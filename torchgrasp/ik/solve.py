@@ -28,7 +28,6 @@ from torchgrasp.threads import single_threaded
 from torchgrasp.values import Contacts, IKSeeds
 
 Method = Literal["levenberg_marquardt", "cobyla"]
-
 EXACT = 1e-6  # sum of squared residuals [mm2] at which a seed is done
 
 

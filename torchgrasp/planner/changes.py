@@ -11,7 +11,6 @@ from torchgrasp.planner.request import Request, finger_sets
 from torchgrasp.scene.scene import Scene
 
 FRICTIONS = (0.4, 0.8, 1.2)  # coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone
-
 UNKNOWN = frozenset({Status.OUT_OF_DOMAIN, Status.TOO_UNCERTAIN})
 AT_TABLE = frozenset({Status.BELOW_TABLE, Status.TABLE_COLLISION, Status.PREGRASP, Status.NO_APPROACH})
 OPEN = frozenset({Status.NOT_CLOSED, Status.DEGENERATE})

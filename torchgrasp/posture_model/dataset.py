@@ -29,7 +29,6 @@ from torchgrasp.posture_model.sample import (
 MANIFEST = "samples.json"  # file that describes the samples of a folder
 KEPT = 128  # chunks that stay in memory: all of a million postures, which take 200 MB
 META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")  # the keys of `SampleSpec.meta`
-
 Chunk = Annotated[int, Range(0, 1_000_000)]
 
 

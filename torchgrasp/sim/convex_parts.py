@@ -22,7 +22,6 @@ from torchgrasp.sim.decompose import decompose
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """Settings of CoACD's search for cuts, which make it narrower and faster than by default."""
-
 _log = logging.getLogger(__name__)
 
 

@@ -16,13 +16,10 @@ from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, pa
 
 OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
 """Names of the object (its body and its free joint), of the table, and of the neighbours, which are numbered."""
-
 HAND_BIT, OBJECT_BIT, TABLE_BIT, FREE_BIT = 1, 2, 4, 3
 """Bits of three collision groups, which all collide except the hand with itself; number of the first bit after them."""
-
 OPTION = {"integrator": "implicitfast", "cone": "elliptic", "impratio": "10", "noslip_iterations": "2"}
 """Options of MuJoCo's solver, from DexGraspBench (arXiv 2412.16490)."""
-
 SOLREF, SOLIMP = "0.005 1", "0.5 0.99 0.0001"
 """Contact springs: time constant [s] and damping ratio, and impedance over depth, as in DexGraspBench."""
 

@@ -15,7 +15,6 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, SceneSpec
 
 STILL = np.zeros(3)  # no force, no torque
-
 NEIGHBOURS, TABLETOP, TARGET = range(3)
 """Indices into `StepContacts.stray`, which sums contacts of the hand other than those of fingers with the object."""
 

@@ -19,10 +19,8 @@ from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.lazy import trimesh
 
 ARMATURE = 1e-3  # inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it
-
 LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
 """Names of the mount's prismatic joints along the world's z axis, and along the approach; at 0 the approach ends."""
-
 SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z")
 """Names of the prismatic joints of a mount that yields, along the world's axes."""
 

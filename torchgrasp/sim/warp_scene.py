@@ -15,7 +15,6 @@ from torchgrasp.sim.scene_spec import SceneSpec
 
 CONTACTS, ROWS = 32, 192
 """Near pairs of shapes of a world on average, and rows of constraints of each: a contact has at most four."""
-
 FIELDS = (
     "body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_subtreemass", "body_inertia",
     "body_invweight0", "dof_invweight0", "jnt_axis", "jnt_range", "actuator_acc0", "geom_dataid", "geom_size",

@@ -26,9 +26,7 @@ CAUSES: dict[str, dict[str, str]] = {
     "task": {"friction": "1", "mass": "kg", "force": "N", "lifted": "1", "displaced": "1", "open loop": "1"},
 }
 """The features with their units, by what they tell about."""
-
 FEATURES = tuple(name for names in CAUSES.values() for name in names)  # all features, in the order of the columns
-
 GRIP = 15.0  # greatest force [N] that a hand which grips as the load asks for may need
 
 

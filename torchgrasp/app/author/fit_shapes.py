@@ -24,7 +24,6 @@ from torchgrasp.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACE
 MESH_KINDS = (".stl", ".obj", ".ply")  # formats of meshes that contain only geometry
 SAVING, SAVING_TIP = 0.12, 0.04
 """A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of all boxes."""
-
 Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 Corners = tuple[np.ndarray, np.ndarray]
 

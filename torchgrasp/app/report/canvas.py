@@ -11,7 +11,6 @@ from torchgrasp.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
 Points = Float[np.ndarray, "n 3"]
 Color = tuple[float, float, float]
 Direction = tuple[float, float, float]
-
 FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")  # colours of the fingers, in grasp order
 AXES = ("#d62728", "#2ca02c", "#1f4fd8")  # colours of x, y and z of a frame
 HAND, OBJECT, TABLE = "#a9b0ba", "#e9d7b3", "#eceae4"

@@ -18,7 +18,6 @@ from torchgrasp.lazy import jinja2
 from torchgrasp.values import Grasps, format_success
 
 Sections = dict[str, list[tuple[str, bytes]]]
-
 GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
 """Titles of the columns of a table of grasps; errors, angles and standard deviations are those of the worst finger."""
 

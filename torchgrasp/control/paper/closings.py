@@ -17,7 +17,6 @@ from torchgrasp.geometry.linalg import limit_norm
 from torchgrasp.plan.forces import grasp_map, internal_forces
 
 Rows = Float[Tensor, "*b 3 3"]
-
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
 POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).

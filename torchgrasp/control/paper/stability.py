@@ -25,7 +25,6 @@ from torchgrasp.posture_model.mixture import check_compatible
 
 STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "logL3"), ("logF1", "logF2", "logF3")
 """Logarithms of spring stiffness [N/m], of the tips' distances from their virtual frame [m], of normal forces [N]."""
-
 NAMES = (*STIFFNESS, *LENGTHS, *FORCES)  # components of the state of a grasp
 LEAST_FORCE = 0.05  # least normal force [N] of a finger in a state
 FILE = "stability.safetensors"  # name of the model in the hand's folder
