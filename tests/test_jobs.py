@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import pickle
 import signal
 import time
 
@@ -9,7 +10,9 @@ import pytest
 import torch
 
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.jobs import run_as_they_end, run_tasks
+from torchgrasp.jobs import pack, run_as_they_end, run_tasks, unpack
+from torchgrasp.planner.schedule import Batch
+from torchgrasp.values import PointCloud
 
 pytest.importorskip("pebble")
 
@@ -109,3 +112,17 @@ def test_bad_arguments_are_named_at_once():
         run_tasks(act, [], workers=-1)
     with pytest.raises(BadArgument, match="limit"):
         run_tasks(act, [], limit=float("nan"))
+
+
+def test_a_packed_value_holds_no_tensor_and_unpacks_to_the_same_value_with_its_cached_attributes():
+    cloud = PointCloud(torch.rand(5, 3), None, torch.zeros(3))
+    vars(cloud)["cached"] = torch.arange(3)
+    value = {"clouds": [cloud, cloud], "batch": Batch(4, 2), "pair": (torch.tensor(2.5), "text"), "class": PointCloud}
+    packed = pickle.dumps(pack(value))
+    assert b"torch.Tensor" not in packed and b"_rebuild_tensor" not in packed
+    found = unpack(pickle.loads(packed))
+    assert torch.equal(found["clouds"][1].points, cloud.points) and found["clouds"][0].normals is None
+    assert torch.equal(found["clouds"][0].cached, torch.arange(3)) and type(found["clouds"][0]) is PointCloud
+    assert found["batch"] == Batch(4, 2) and isinstance(found["batch"], Batch)
+    assert found["pair"][0].shape == () and float(found["pair"][0]) == 2.5 and found["pair"][1] == "text"
+    assert found["class"] is PointCloud

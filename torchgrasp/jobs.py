@@ -1,6 +1,7 @@
 """Tasks in worker processes: a worker that hangs or dies loses only its own task."""
 
 import contextlib
+import dataclasses
 import math
 import multiprocessing
 import os
@@ -10,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, TimeoutError
 from concurrent.futures.process import BrokenProcessPool
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import torch
 
@@ -35,8 +36,8 @@ def run_tasks(
     whose process dies twice gives `Status.WORKER_DIED`. The error of a task is raised in place of its result. All
     workers end when the caller stops iterating.
 
-    Each worker imports the module of the function. Tasks must hold no tensors, because processes would share them. If
-    `workers` is 0, the tasks run in this process, without the `limit` [s] on the time of a task.
+    Each worker imports the module of the function. Tasks must hold no tensors, because processes would share them: see
+    `pack`. If `workers` is 0, the tasks run in this process, without the `limit` [s] on the time of a task.
     """
     return _in_order(_run(function, tasks, workers, limit))
 
@@ -147,3 +148,40 @@ def _begin(function: Callable[..., Any]) -> None:
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
+
+
+class _Packed(NamedTuple):
+    """A tensor as array with the name of its device, or the attributes of a dataclass, cached ones among them."""
+
+    kind: type | str
+    content: Any
+
+
+def pack(value: Any) -> Any:
+    """Return a value for another process: arrays in place of tensors, which processes would share; see `unpack`."""
+    if isinstance(value, torch.Tensor):
+        return _Packed(str(value.device), value.detach().cpu().numpy())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _Packed(type(value), pack(vars(value)))
+    return _map_items(pack, value)
+
+
+def unpack(packed: Any) -> Any:
+    """Return the value that `pack` packed, with its tensors on their devices."""
+    if not isinstance(packed, _Packed):
+        return _map_items(unpack, packed)
+    if isinstance(packed.kind, str):
+        return torch.from_numpy(packed.content).to(torch.device(packed.kind))
+    value = object.__new__(packed.kind)
+    vars(value).update(unpack(packed.content))
+    return value
+
+
+def _map_items(function: Callable[[Any], Any], value: Any) -> Any:
+    """Return a dictionary, list or tuple with the results of a function of its items; another value as it is."""
+    if isinstance(value, dict):
+        return {key: function(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        items = map(function, value)
+        return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
+    return value

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import itertools
 import math
-import pickle
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +15,7 @@ from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
-from torchgrasp.jobs import run_tasks
+from torchgrasp.jobs import pack, run_tasks, unpack
 from torchgrasp.planner.batches import plan_hands
 from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.planner.request import Request
@@ -97,7 +96,9 @@ def _plan_stack(
 def _prepare(request: Request) -> Problem | Grasps:
     """Estimate the shape of a request's object and draw initial guesses; refuse a bad cloud as `_plan_or_refuse`."""
     try:
-        return Problem.of(request, settle_hand(request.hands[0], torch.device("cpu"))).prepared()
+        problem = Problem.of(request, settle_hand(request.hands[0], torch.device("cpu"))).prepared()
+        bare = dataclasses.replace(request.hand)  # a problem that another process plans needs no caches
+        return problem.replace(hand=bare, request=dataclasses.replace(request, hand=bare))
     except MissingExtra:
         raise
     except GraspError as error:
@@ -145,13 +146,13 @@ def _each(
         return
     hand = requests[0].hand
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)  # without the caches
-    tasks = ((function, source, pickle.dumps(dict(vars(request), hand=None))) for request in requests)
+    tasks = ((function, source, pack(dict(vars(request), hand=None))) for request in requests)
     with contextlib.closing(run_tasks(_call, tasks, workers, 3600.0)) as results:
         for found in results:
-            yield _refused(hand, found.sentence) if isinstance(found, Status) else pickle.loads(found)  # noqa: S301 ours
+            yield _refused(hand, found.sentence) if isinstance(found, Status) else unpack(found)
 
 
-def _call(function: Callable[[Request], Any], source: HandSource, request: bytes) -> bytes:
+def _call(function: Callable[[Request], Any], source: HandSource, packed: dict[str, Any]) -> Any:
     """Call a function of a request in a worker process, which loads the hand itself."""
     hand = load_hand(source.urdf_path.parent, source.option)
-    return pickle.dumps(function(Request(**dict(pickle.loads(request), hand=hand))))  # noqa: S301 our own process
+    return pack(function(Request(**dict(unpack(packed), hand=hand))))
