@@ -120,7 +120,7 @@ def test_a_packed_value_holds_no_tensor_and_unpacks_to_the_same_value_with_its_c
     value = {"clouds": [cloud, cloud], "batch": Batch(4, 2), "pair": (torch.tensor(2.5), "text"), "class": PointCloud}
     packed = pickle.dumps(pack(value))
     assert b"torch.Tensor" not in packed and b"_rebuild_tensor" not in packed
-    found = unpack(pickle.loads(packed))
+    found = unpack(pickle.loads(packed))  # noqa: S301 packed here
     assert torch.equal(found["clouds"][1].points, cloud.points) and found["clouds"][0].normals is None
     assert torch.equal(found["clouds"][0].cached, torch.arange(3)) and type(found["clouds"][0]) is PointCloud
     assert found["batch"] == Batch(4, 2) and isinstance(found["batch"], Batch)
