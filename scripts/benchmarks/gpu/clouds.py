@@ -1,19 +1,18 @@
 """Plans of many clouds at once beside plans of each alone: the same grasps, and how many of them a second."""
 
-import pickle
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from benchmarks.common import Options, Row, bench
 from benchmarks.gpu.launches import views
-from torchgrasp import ContactSpec, Grasps, Status, load_hand, plan_grasps
+from torchgrasp import ContactSpec, Grasps, PointCloud, Status, load_hand, plan_grasps
 from torchgrasp.checks import checked
-from torchgrasp.jobs import run_tasks
+from torchgrasp.jobs import pack, run_tasks, unpack
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.request import Request
@@ -32,7 +31,7 @@ def plan_clouds(o: Options) -> list[Row]:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     hand, workers, rows = load_hand(o.hands[0]), max(o.workers, 1), list[Row]()
     packed = run_tasks(see_view, [(k,) for k in range(max(o.batches))], workers, 600.0)
-    seen = [pickle.loads(x) for x in packed if isinstance(x, bytes)]  # noqa: S301 of our own processes
+    seen: list[PointCloud] = [unpack(x) for x in packed]
     requests = [Request(cloud, hand, SPEC, o.starts) for cloud in seen]
     problems, shaped = timed(lambda: list(estimate_shapes(requests, workers)))
     rows.append(Row(f"shapes of {len(seen)} clouds, {workers} processes", "-", f"{shaped:.1f} s", None, {"s": shaped}))
@@ -51,12 +50,12 @@ def plan_clouds(o: Options) -> list[Row]:
     return rows
 
 
-def see_view(k: int) -> bytes:
+def see_view(k: int) -> Any:
     """Return a view of a shipped object with few points, packed, for another process."""
     torch.set_num_threads(1)
     cloud = views(1, k)[0]
     rows = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(k))[:POINTS].sort().values
-    return pickle.dumps(cloud.select(rows))
+    return pack(cloud.select(rows))
 
 
 @checked
