@@ -193,6 +193,23 @@ def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: in
     return tuple(map(torch.cat, zip(*map(evaluate, x.split(size)), strict=True)))
 
 
+def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
+    """Return the indices that sort rows ascending by the first key; ties are sorted by the next key."""
+    order = torch.argsort(keys[-1], stable=True)
+    for key in reversed(keys[:-1]):
+        order = order[torch.argsort(key[order], stable=True)]
+    return order
+
+
+def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
+    """Return the rank (from 0) of each row in its group, sorted ascending by the first key, ties by the next key."""
+    order = lexical_order(group, *keys)
+    grouped = group[order].contiguous()
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(order), device=order.device) - torch.searchsorted(grouped, grouped)
+    return rank
+
+
 def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
     """Return all tensors of a value and of the values in its fields by dotted name, such as `contacts.points`."""
     tensors: dict[str, Tensor] = {}

@@ -43,7 +43,7 @@ def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generat
     f, pairs = spec.fingertips, spec.fingertips * (spec.fingertips - 1) // 2
     tension = normalise_tensions(points, torch.rand(24, pairs, generator=generator, dtype=torch.float64))
     strict = dataclasses.replace(spec, max_variance=0.01)  # so that some points are too uncertain
-    problem = JointProblem.of(given, shape, ContactProblem.of(shape, strict))
+    problem = JointProblem(given.hand, shape, ContactProblem.of(shape, strict), given.world)
     flat = flatness_constraint(shape, points, 0.2, spec.ring_radius / shape.scale)
 
     def rows(state: JointState):
@@ -75,7 +75,7 @@ def test_hands_that_cannot_reach_are_given_up_and_the_others_named(scene):
     pose[far, 0, 3] += 5.0  # steps are short: no hand comes back from there
     start = Configuration(seeds.joints, pose)
     points = shape.normalise(assign(given.contacts, seeds).points)
-    problem = JointProblem.of(given, shape, ContactProblem.of(shape, spec))
+    problem = JointProblem(given.hand, shape, ContactProblem.of(shape, spec), given.world)
     configuration, _, rows = problem.solve(start, points)
     assert len(rows) > 0 and not bool(far[rows].any()) and len(configuration) == len(rows)
     moved = torch.linalg.vector_norm(configuration.obj_from_hand[:, :3, 3] - pose[rows, :3, 3], dim=-1)

@@ -5,7 +5,8 @@ import math
 import torch
 
 from tests.make import near, real, spokes
-from torchgrasp.ik.ranking import centred_friction, rank_in_group
+from torchgrasp.base import rank_in_group
+from torchgrasp.ik.candidates import centred_friction
 from torchgrasp.values import Contacts
 
 

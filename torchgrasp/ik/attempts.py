@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, at_once, join, map_tensors
+from torchgrasp.base import Batch, at_once, join, lexical_order, map_tensors, rank_in_group
 from torchgrasp.checks import checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
@@ -25,7 +25,6 @@ from torchgrasp.ik.candidates import (
 )
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.ranking import lexical_order, rank_in_group
 from torchgrasp.ik.refine import ITERATIONS, grasp_residuals, refine, tip_targets
 from torchgrasp.values import Contacts, Grasps, IKSeeds
 

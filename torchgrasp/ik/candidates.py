@@ -1,4 +1,4 @@
-"""The input of the grasp solvers, and the geometric checks that turn candidate configurations into grasps."""
+"""The input of the grasp solvers, and the checks and scores that turn candidate configurations into grasps."""
 
 import dataclasses
 import math
@@ -13,11 +13,11 @@ from torchgrasp.base import Batch, Value
 from torchgrasp.checks import ANY, Length, Rows, checked, show
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.geometry.frames import rotate
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import find_approach, motion_clearance, opened_pose
-from torchgrasp.ik.ranking import score
 from torchgrasp.ik.refine import open_hand, tip_targets
 from torchgrasp.plan.feasibility import first_violation
 from torchgrasp.values import Certificate, Contacts, Grasps, IKSeeds
@@ -221,3 +221,20 @@ def _keep_clear(
         status[ready[room < 0]] = int(Status.NEIGHBOUR_COLLISION)
     else:
         status[pushed], approach[pushed] = int(Status.OK), direction[clearance >= 0]
+
+
+def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
+    """Return the friction coefficient that each contact set needs if all forces point to the contacts' centroid."""
+    inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
+    cosine = -(inward * contacts.normals).sum(-1)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(inward, contacts.normals), dim=-1)
+    return (sine / cosine.clamp_min(1e-3)).amax(1)
+
+
+def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "*g 3"]) -> Float[Tensor, "g"]:
+    """Return the geometric score of each grasp, at most 0; a higher score is better.
+
+    Three things lower it: the contacts' distance from `center` [m], the friction needed, and the angle off the pads.
+    """
+    offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
+    return -(offset / 0.02 + centred_friction(contacts) + normal_angle.amax(1) / 0.8)

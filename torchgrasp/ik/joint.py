@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, at_once, spread
+from torchgrasp.base import Batch, at_once, rank_in_group, spread
 from torchgrasp.checks import checked
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
@@ -20,7 +20,6 @@ from torchgrasp.ik.attempts import Attempts, assign, best_first, best_grasps, tr
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
-from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
 from torchgrasp.plan.certify import certify
 from torchgrasp.plan.feasibility import FlatnessConstraint, check_feasibility, flatness_constraint
@@ -72,11 +71,6 @@ class JointProblem:
     shape: Shape
     contact_problem: ContactProblem
     world: CollisionWorld
-
-    @classmethod
-    def of(cls, problem: GraspProblem, shape: Shape, contact_problem: ContactProblem) -> "JointProblem":
-        """Return the problem of the hand and the contact sets of `problem`."""
-        return cls(problem.hand, shape, contact_problem, problem.world)
 
     def rows(self, index: Int[Tensor, "k"]) -> "JointProblem":
         """Return the problems of some of the rows."""
@@ -192,5 +186,6 @@ def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: Conta
     """
     seeds = problem.drop_unreachable(seeds)
     attempts = try_best_seeds(problem, seeds)
-    solve_sliding(JointProblem.of(problem, shape, ContactProblem.of(shape, spec)), problem, seeds, attempts)
+    joint_problem = JointProblem(problem.hand, shape, ContactProblem.of(shape, spec), problem.world)
+    solve_sliding(joint_problem, problem, seeds, attempts)
     return best_first(best_grasps(attempts)[0])

@@ -145,13 +145,8 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> floa
 def _closing(hand: Hand, opened: Configuration, closed: Configuration) -> Float[Tensor, "g k s 3"]:
     """Return the centres [m] of the collision spheres while a hand closes and goes down, at k equal steps."""
     shares = torch.linspace(0, 1, 6, device="cpu").tolist()
-    postures = [
-        Configuration(
-            torch.lerp(opened.joints, closed.joints, share),
-            torch.lerp(opened.obj_from_hand, closed.obj_from_hand, share),  # equal rotations
-        )
-        for share in shares
-    ]
+    ends, poses = (opened.joints, closed.joints), (opened.obj_from_hand, closed.obj_from_hand)  # equal rotations
+    postures = [Configuration(torch.lerp(*ends, share), torch.lerp(*poses, share)) for share in shares]
     return torch.stack([_centres(hand, posture) for posture in postures], 1)
 
 

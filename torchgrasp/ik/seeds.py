@@ -10,14 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, at_once, check_device, check_whole, join, settle
+from torchgrasp.base import Value, at_once, check_device, check_whole, join, lexical_order, settle
 from torchgrasp.checks import Count, Positive, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
-from torchgrasp.ik.ranking import lexical_order
 from torchgrasp.ik.refine import TIP_WEIGHT
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, check_compatible, encode
 from torchgrasp.posture_model.sample import sample_configurations

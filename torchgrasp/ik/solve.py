@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, join, pick, settle
+from torchgrasp.base import Batch, join, pick, rank_in_group, settle
 from torchgrasp.checks import ANY, check_tensor, checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.frames import degenerate
@@ -20,7 +20,6 @@ from torchgrasp.ik.attempts import Attempts, assign, refine_by_cobyla
 from torchgrasp.ik.candidates import measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.refine import refine
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures, query_mixture
 from torchgrasp.posture_model.mixture import GraspMixture

@@ -49,17 +49,13 @@ def normal_variation(
     ring = points[:, :, None] + spread(radius, directions) * directions
     for wall, own in walls_at(shape, points):
         own = torch.nonzero(own & among).unbind(1)
-        variation[own] = _wall_variation(rows_of(wall, own[0]), ring[own], normals[own])
+        surface = rows_of(wall, own[0])
+        around = project(surface, ring[own], steps=1)
+        there = unit(surface.mean_and_gradient(around.flatten(0, 1))[1]).view_as(around)
+        here = normals[own][:, None].expand_as(there)
+        sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
+        variation[own] = torch.atan2(sine, (here * there).sum(-1)).amax(-1)
     return variation
-
-
-def _wall_variation(shape: Shape, ring: Float[Tensor, "k n 3"], normals: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
-    """Return the largest angle [rad] between each contact's normal and the surface normals at its `ring` points."""
-    _, gradient = shape.mean_and_gradient(project(shape, ring, steps=1).flatten(0, 1))
-    there = unit(gradient).view_as(ring)
-    here = normals[:, None].expand_as(there)
-    sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
-    return torch.atan2(sine, (here * there).sum(-1)).amax(-1)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -222,18 +222,9 @@ class ContactProblem:
         centre_by_point = identity + spread(self.tip_radius, jet.normal_jacobian) * jet.normal_jacobian
         cones, cones_by_x = self._cones(points, tension, jet)
         distances, distances_by_x = self._distances(points, jet.normals, centre_by_point)
-        values = [
-            cones,
-            (jet.variance - threshold) / half_slope,
-            ((points * points).sum(-1) - edge**2) / (2 * edge),
-            distances,
-        ]
-        jacobians = [
-            cones_by_x,
-            own(jet.variance_gradient / half_slope),
-            own(points / spread(ball, points)),
-            distances_by_x,
-        ]
+        beyond, beyond_by_x = ((points * points).sum(-1) - edge**2) / (2 * edge), own(points / spread(ball, points))
+        values = [cones, (jet.variance - threshold) / half_slope, beyond, distances]
+        jacobians = [cones_by_x, own(jet.variance_gradient / half_slope), beyond_by_x, distances_by_x]
         if self.up is not None:
             up = self.up.to(points)
             values.append((1 - INSIDE) * 0.1 - self.room(points, jet.normals))

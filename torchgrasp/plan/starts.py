@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.errors import BadArgument
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.plan.closure import Vectors, closed_exact
 from torchgrasp.plan.feasibility import normal_variation
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of, walls_of
@@ -56,7 +56,7 @@ class Settled(NamedTuple):
     """A specification with a known `flat_radius`, and p candidate contacts on flat surface, with their normals."""
 
     spec: ContactSpec
-    candidates: tuple[Float[Tensor, "p 3"], Float[Tensor, "p 3"]] | None  # None: no flatness
+    candidates: tuple[Points, Points] | None  # None: no flatness
 
 
 def drawn_starts(shape: Shape, settled: Settled, sizes: Iterable[int], seed: int) -> Iterator[Float[Tensor, "_ f 3"]]:
@@ -140,11 +140,7 @@ def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tens
 
 
 def candidate_rows(
-    problem: ContactProblem,
-    points: Float[Tensor, "p 3"],
-    normals: Float[Tensor, "p 3"],
-    starts: int,
-    generator: torch.Generator,
+    problem: ContactProblem, points: Points, normals: Points, starts: int, generator: torch.Generator
 ) -> tuple[Vectors, int]:
     """Return random sets of candidate contacts, and how many of them have force closure and are well separated.
 

@@ -8,12 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import join
+from torchgrasp.base import join, rank_in_group
 from torchgrasp.checks import Count, checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.ik.attempts import seed_costs
-from torchgrasp.ik.ranking import rank_in_group
 from torchgrasp.ik.seeds import nearest_postures, query_mixture
 from torchgrasp.plan.certify import certify
 from torchgrasp.planner.stack import Owner, Stack, by_cloud
@@ -137,12 +136,7 @@ class Pool:
 
 
 def _choose_of_each(
-    points: Float[Tensor, "n d"],
-    cost: Float[Tensor, "n"],
-    owner: Owner,
-    before: Int[Tensor, "t"],
-    most: int,
-    clouds: int,
+    points: Float[Tensor, "n d"], cost: Float[Tensor, "n"], owner: Owner, before: Tensor, most: int, clouds: int
 ) -> Int[Tensor, "k"]:
     """Return for each of several clouds at most `most` of its cheapest contact sets, far from each other and `before`.
 
@@ -170,10 +164,9 @@ def _choose_of_each(
 
 def _table(owner: Owner, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, "c m"]]:
     """Return the indices of the rows of each cloud, in their order, and a mask of the places that hold one."""
-    order, count = torch.argsort(owner, stable=True), torch.bincount(owner, minlength=clouds)
-    slot = torch.arange(len(owner), device=owner.device) - (count.cumsum(0) - count)[owner[order]]
+    count = torch.bincount(owner, minlength=clouds)
     table = owner.new_zeros(clouds, int(count.max()) if len(owner) else 0)
-    table[owner[order], slot] = order
+    table[owner, rank_in_group(owner)] = torch.arange(len(owner), device=owner.device)
     return table, torch.arange(table.shape[1], device=owner.device) < count[:, None]
 
 

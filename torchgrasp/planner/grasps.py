@@ -19,31 +19,14 @@ from torchgrasp.values import Grasps, PointCloud
 
 @overload
 def plan_grasps(
-    cloud: PointCloud | Scene,
-    hand: Hand,
-    spec: ContactSpec | None = None,
-    starts: Count = 1000,
-    seed: Seed = 0,
-    *,
-    time_budget: Budget | None = None,
-    **options: Unpack[PlanOptions],
-) -> Grasps: ...
-
-
+    cloud: PointCloud | Scene, hand: Hand, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0, *,
+    time_budget: Budget | None = None, **options: Unpack[PlanOptions],
+) -> Grasps: ...  # fmt: skip
 @overload
 def plan_grasps(
-    cloud: Sequence[PointCloud],
-    hand: Hand,
-    spec: ContactSpec | None = None,
-    starts: Count = 1000,
-    seed: Seed = 0,
-    *,
-    time_budget: Budget | None = None,
-    workers: Annotated[int, Range(0, 1024)] = 0,
-    **options: Unpack[PlanOptions],
-) -> list[Grasps]: ...
-
-
+    cloud: Sequence[PointCloud], hand: Hand, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0, *,
+    time_budget: Budget | None = None, workers: Annotated[int, Range(0, 1024)] = 0, **options: Unpack[PlanOptions],
+) -> list[Grasps]: ...  # fmt: skip
 @checked
 @single_threaded
 def plan_grasps(

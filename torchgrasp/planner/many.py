@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import math
 import time
@@ -41,7 +42,7 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
     if together and requests[0].mode == "joint":
         planned = plan_stacks(requests, estimate_shapes(requests, workers), next(iter(devices)))
     else:
-        planned = _each(_plan_or_refuse, requests, workers)
+        planned = _each(plan_request, requests, workers)
     return [grasps.to(cloud.points.device) for cloud, grasps in zip(clouds, planned, strict=True)]
 
 
@@ -80,35 +81,27 @@ def _plan_stack(
 ) -> Iterator[Grasps]:
     """Yield the grasps of prepared problems that are planned at once on a device."""
     hand = settle_hand(requests[0].hands[0], torch.device("cpu"))
-    problems = [
-        None if isinstance(x, Grasps) else x.replace(hand=hand, request=request)
-        for x, request in zip(prepared, requests, strict=True)
-    ]
-    planned = iter(plan_hands([x for x in problems if x is not None], deadline, device))
-    for one, problem in zip(prepared, problems, strict=True):
-        if problem is None:
-            assert isinstance(one, Grasps)
-            yield one
+    pairs = zip(prepared, requests, strict=True)
+    problems = [x if isinstance(x, Grasps) else x.replace(hand=hand, request=request) for x, request in pairs]
+    planned = iter(plan_hands([x for x in problems if isinstance(x, Problem)], deadline, device))
+    for x in problems:
+        if isinstance(x, Grasps):
+            yield x
         else:
-            yield finish(problem.request, [problem.give_back(grasps.to("cpu")) for grasps in next(planned)])
+            yield finish(x.request, [x.give_back(grasps.to("cpu")) for grasps in next(planned)])
 
 
-def _prepare(request: Request) -> Problem | Grasps:
-    """Estimate the shape of a request's object and draw initial guesses; refuse a bad cloud as `_plan_or_refuse`."""
+def _prepare(request: Request) -> Problem:
+    """Estimate the shape of a request's object, and draw initial guesses."""
+    problem = Problem.of(request, settle_hand(request.hands[0], torch.device("cpu"))).prepared()
+    bare = dataclasses.replace(request.hand)  # a problem that another process plans needs no caches
+    return problem.replace(hand=bare, request=dataclasses.replace(request, hand=bare))
+
+
+def _or_refuse(function: Callable[[Request], Result], request: Request) -> Result | Grasps:
+    """Return a function of a request; if its cloud is bad, return an empty set of grasps with the reason in `meta`."""
     try:
-        problem = Problem.of(request, settle_hand(request.hands[0], torch.device("cpu"))).prepared()
-        bare = dataclasses.replace(request.hand)  # a problem that another process plans needs no caches
-        return problem.replace(hand=bare, request=dataclasses.replace(request, hand=bare))
-    except MissingExtra:
-        raise
-    except GraspError as error:
-        return _refused(request.hand, " ".join(str(error).split()))
-
-
-def _plan_or_refuse(request: Request) -> Grasps:
-    """Return the grasps of a request; if its cloud is bad, return an empty set with the reason in `meta`."""
-    try:
-        return plan_request(request)
+        return function(request)
     except MissingExtra:
         raise
     except GraspError as error:
@@ -139,14 +132,13 @@ def _each(
     function: Callable[[Request], Result], requests: Sequence[Request], workers: int
 ) -> Generator[Result | Grasps, None, None]:
     """Yield a function's results for requests with the same hand, in worker processes if there are any."""
-    if not workers:
-        yield from map(function, requests)
-        return
-    if not requests:
+    call = functools.partial(_or_refuse, function)
+    if not workers or not requests:
+        yield from map(call, requests)
         return
     hand = requests[0].hand
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)  # without the caches
-    tasks = ((function, source, pack(dict(vars(request), hand=None))) for request in requests)
+    tasks = ((call, source, pack(dict(vars(request), hand=None))) for request in requests)
     with contextlib.closing(run_tasks(_call, tasks, workers, 3600.0)) as results:
         for found in results:
             yield _refused(hand, found.sentence) if isinstance(found, Status) else unpack(found)

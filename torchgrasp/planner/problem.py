@@ -22,7 +22,7 @@ from torchgrasp.ik.candidates import Reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
 from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, settle_flatness
-from torchgrasp.planner.request import Observer, Request, ignore
+from torchgrasp.planner.request import Request, ignore
 from torchgrasp.planner.schedule import TRIED, TRIED_IN_SCENE, Batch, schedule
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
@@ -90,21 +90,12 @@ class Problem:
         _ = self.drawn, self.body, self.vague
         return self
 
-    def for_hand(self, hand: Hand, observer: Observer) -> "Problem":
-        """Return the problem for a hand with another set of fingers, and with another observer."""
-        request = dataclasses.replace(self.request, observer=observer)
-        return self.replace("flat", "drawn", request=request, hand=settle_hand(hand, self.shape.device))
-
     def for_request(self, request: Request, hand: Hand, postures: int) -> "Problem":
         """Return the problem of another request on the same object and table, with a small library of `postures`."""
         spec = dataclasses.replace(request.contact_spec, table=self.given_spec.table)
-        new = {
-            "request": request,
-            "hand": settle_hand(hand, self.shape.device),
-            "given_spec": spec,
-            "postures": postures,
-        }
-        return self.replace("flat", "drawn", "batches", "obstacles", "world", "buried", "reachable", **new)
+        new = {"request": request, "hand": settle_hand(hand, self.shape.device), "given_spec": spec}
+        dropped = "flat", "drawn", "batches", "obstacles", "world", "buried", "reachable"
+        return self.replace(*dropped, postures=postures, **new)
 
     def replace(self, *dropped: str, **changes: Any) -> "Problem":
         """Return the problem with changed fields; it keeps all derived values except those `dropped`."""

@@ -1,5 +1,6 @@
 """The plan of one request: its batches, joined or one by one; of several sets of fingers the best set's."""
 
+import dataclasses
 import math
 import time
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from torchgrasp.base import count_status
 from torchgrasp.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.batches import plan_hand, rank_together
-from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.planner.report import describe
 from torchgrasp.planner.request import Request
 from torchgrasp.values import Grasps
@@ -63,7 +64,8 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
     best, observer = None, problem.request.observer
     for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
         stages = list[tuple[str, str, Any]]()
-        problem = problem.for_hand(hand, lambda *stage: stages.append(stage))  # noqa: B023 called at once
+        request = dataclasses.replace(problem.request, observer=lambda *stage: stages.append(stage))  # noqa: B023 at once
+        problem = problem.replace("flat", "drawn", request=request, hand=settle_hand(hand, problem.shape.device))
         now = time.monotonic()
         batches = list(plan_hand(problem, now + (deadline - now) / left))
         grasps = problem.give_back(rank_together(batches, problem.request.order))

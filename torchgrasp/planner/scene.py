@@ -112,11 +112,10 @@ def plan_scene(
     for label in order_by_ease(scene):
         if judged[label] is not Status.OK:
             plans.append(ThingPlan(label, 0.0, reason=judged[label].sentence, status=judged[label]))
-            continue
-        if any(thing.success >= enough for thing in plans):
+        elif any(thing.success >= enough for thing in plans):
             plans.append(ThingPlan(label, 0.0, reason="not tried: another object is easy enough"))
-            continue
-        plans.append(_plan_thing(dataclasses.replace(scene, target=label), plan))
+        else:
+            plans.append(_plan_thing(dataclasses.replace(scene, target=label), plan))
     # known success (highest first), then unknown success (NaN), then no grasp
     plans.sort(key=lambda x: (x.grasps is None, math.isnan(x.success), 0.0 if math.isnan(x.success) else -x.success))
     return ScenePlan(tuple(plans))

@@ -74,9 +74,8 @@ class Stack:
     @cached_property
     def library(self) -> PostureLibrary:
         """Random postures of the hand, from which initial postures near contacts are chosen."""
-        return settle(
-            PostureLibrary.of(self.first.hand, self.first.postures, self.first.request.seed), self.body.center.device
-        )
+        library = PostureLibrary.of(self.first.hand, self.first.postures, self.first.request.seed)
+        return settle(library, self.body.center.device)
 
     def plans(self) -> Iterator[tuple[ContactPlan, Owner]]:
         """Yield the plan of each batch that has new guesses, with the cloud of each row.

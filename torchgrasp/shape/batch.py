@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, at_once, spread
+from torchgrasp.base import Value, at_once, rank_in_group, spread
 from torchgrasp.errors import BadArgument
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.jets import Weighted, evaluate_jet, evaluate_mean, evaluate_mean_jet
@@ -94,13 +94,10 @@ class Walls(Value):
         if rows.device.type == "cpu":  # few surfaces have rows in a small chunk
             found, group = torch.unique(wall, return_inverse=True)
             matrix = matrix[found]
-        order = torch.argsort(group, stable=True)
-        group, count = group[order], torch.bincount(group, minlength=len(matrix))
-        slot = torch.arange(len(rows), device=rows.device) - (count.cumsum(0) - count)[group]
-        padded = rows.new_zeros(len(matrix), int(count.max()), rows.shape[1])
-        padded[group, slot] = rows[order]
-        back = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
-        return tuple(x[group, slot][back] for x in function(padded, matrix))
+        slot = rank_in_group(group)
+        padded = rows.new_zeros(len(matrix), int(torch.bincount(group).max()), rows.shape[1])
+        padded[group, slot] = rows
+        return tuple(x[group, slot] for x in function(padded, matrix))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,10 +136,8 @@ class ShapeBatch(Value):
         wall = torch.stack([own, torch.where(second, len(shapes) - 1 + second.cumsum(0), own)], 1).to(device)
         numbers = [[getattr(s, name) for s in shapes] for name in ("scale", "domain_radius", "std_factor")]
         scales, radii, factors = (torch.tensor(x, dtype=torch.float64, device=device) for x in numbers)
-        centers, surfaces = (
-            torch.stack([s.center for s in shapes]).double().to(device),
-            Walls.of([*outer, *inner], device),
-        )
+        centers = torch.stack([s.center for s in shapes]).double().to(device)
+        surfaces = Walls.of([*outer, *inner], device)
         return cls(surfaces, wall, centers, scales, radii, factors, own.to(device), bool(inner))
 
     @property
@@ -232,8 +227,11 @@ class ShapeBatch(Value):
         outer, inner = self._wall(x).unbind(1)
         if not self.hollow:
             return outer
-        mean = [self._evaluate(partial(_mean_of, self.surfaces), x, wall)[0] for wall in (outer, inner)]
-        return torch.where(mean[1] > mean[0], inner, outer)
+
+        def mean(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
+            return evaluate_mean(self.surfaces.weighted(wall), part, gradient=False)
+
+        return torch.where(self._evaluate(mean, x, inner)[0] > self._evaluate(mean, x, outer)[0], inner, outer)
 
     def _evaluate(self, evaluate: Evaluate, x: Float[Tensor, "q 3"], wall: Tensor | None = None) -> tuple[Tensor, ...]:
         """Return the results of a function of points and surfaces, for chunks of points, joined."""
@@ -241,7 +239,3 @@ class ShapeBatch(Value):
         size = at_once(x, 256)
         parts = [evaluate(*part) for part in zip(x.split(size), wall.split(size), strict=True)]
         return tuple(map(torch.cat, zip(*parts, strict=True)))
-
-
-def _mean_of(surfaces: Walls, x: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
-    return evaluate_mean(surfaces.weighted(wall), x, gradient=False)

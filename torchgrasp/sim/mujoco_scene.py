@@ -198,7 +198,13 @@ def scene_mjcf(spec: SceneSpec) -> str:
     for k, (body, hulls) in enumerate(zip((spec.body, *spec.neighbours), spec.hulls, strict=True)):
         name, hits = (NEIGHBOUR.format(k - 1), OBJECT_BIT) if k else (OBJECT, 0)
         _add_body(asset, world, name, body, hulls, _bits(OBJECT_BIT, HAND_BIT | TABLE_BIT | hits), slick)
-    _add_hand(world, spec, urdf)
+    mount = world
+    for slide in spec.slides:
+        mount = ET.SubElement(mount, "body", name=slide.name, gravcomp="1")
+        _weigh(mount, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
+        limits = {"axis": format_numbers(slide.axis), "range": format_numbers((slide.lower, slide.upper))}
+        ET.SubElement(mount, "joint", limits, name=slide.name, type="slide")
+    add_links(mount, urdf, spec.world_from_hand, pair_masks(spec.self_pairs, FREE_BIT))
     for name in movable:
         add_drive(actuator, name, spec.drives[name])
     for slide in spec.slides:
@@ -220,17 +226,6 @@ def _add_body(
     for k, vertices in enumerate(hulls):
         ET.SubElement(asset, "mesh", name=f"{name}_{k}", vertex=format_numbers(vertices.ravel()))
         ET.SubElement(body, "geom", dict(bits), type="mesh", mesh=f"{name}_{k}", friction=friction)
-
-
-def _add_hand(world: ET.Element, spec: SceneSpec, urdf: Urdf) -> None:
-    """Add the hand on its mount to the world."""
-    mount = world
-    for slide in spec.slides:
-        mount = ET.SubElement(mount, "body", name=slide.name, gravcomp="1")
-        _weigh(mount, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
-        limits = {"axis": format_numbers(slide.axis), "range": format_numbers((slide.lower, slide.upper))}
-        ET.SubElement(mount, "joint", limits, name=slide.name, type="slide")
-    add_links(mount, urdf, spec.world_from_hand, pair_masks(spec.self_pairs, FREE_BIT))
 
 
 def add_links(

@@ -241,7 +241,6 @@ def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[
                 hits[two if one == owner else one] |= 1 << bit
         left = [pair for pair in left if owner not in pair]
     if left:
-        raise HandFileError(
-            "self_collision", f"{len(left)} pairs too many", f"pairs that {bits - first} bits distinguish"
-        )
+        allowed = f"pairs that {bits - first} bits distinguish"
+        raise HandFileError("self_collision", f"{len(left)} pairs too many", allowed)
     return {name: (kinds[name], hits[name]) for name in kinds}

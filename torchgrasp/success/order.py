@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.base import lexical_order
 from torchgrasp.errors import BadArgument, Status
-from torchgrasp.ik.ranking import lexical_order
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import load_model
 from torchgrasp.success.promise import find_promise
