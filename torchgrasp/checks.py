@@ -5,13 +5,14 @@ signature: type, shape, dtype, finite numbers, range. Calls that the library mak
 """
 
 import collections.abc
+import contextlib
 import dataclasses
 import functools
 import inspect
 import threading
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, overload
@@ -106,12 +107,27 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
         shared.check_numbers()
         _thread.inside = True
         try:
-            return function(*bound.args, **bound.kwargs)
+            result = function(*bound.args, **bound.kwargs)
         finally:
             _thread.inside = inside
+        return _each(result) if not inside and inspect.isgenerator(result) else result
 
     setattr(call, "__checked__", True)  # noqa: B010
     return call
+
+
+def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
+    """Yield the items of a generator, whose own calls of the library are not checked."""
+    with contextlib.closing(items):
+        while True:
+            inside, _thread.inside = getattr(_thread, "inside", False), True
+            try:
+                item = next(items)
+            except StopIteration:
+                return
+            finally:
+                _thread.inside = inside
+            yield item
 
 
 def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:

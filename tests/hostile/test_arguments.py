@@ -11,6 +11,7 @@ from torch.autograd import forward_ad
 import torchgrasp
 from tests.hostile.arguments import HOSTILE, behind, checked_things, methods_of, public, required, wrong_arguments
 from tests.hostile.samples import sample
+from torchgrasp.checks import Count, checked
 from torchgrasp.errors import BadArgument
 
 MADE_INSIDE = {
@@ -103,3 +104,26 @@ def test_transformed_tensors_are_refused_where_nothing_is_differentiable(transfo
     shape = torchgrasp.fit_shape(torchgrasp.load_object("jug").view)
     with pytest.raises(BadArgument, match=f"contacts.points: .*{found}"):
         transform(margin, torch.eye(3)[None])
+
+
+def test_calls_of_the_library_are_not_checked_again_in_functions_nor_in_generators():
+    @checked
+    def double(number: Count) -> int:
+        return 2 * number
+
+    @checked
+    def call(number: Count) -> int:
+        return double(-number)
+
+    @checked
+    def call_each(number: Count):
+        yield from (double(-k) for k in range(1, number + 1))
+
+    assert call(1) == -2
+    items = call_each(2)
+    assert next(items) == -2
+    with pytest.raises(BadArgument, match="number"):
+        double(-1)  # between two items the caller's own calls are checked
+    assert list(items) == [-4]
+    with pytest.raises(BadArgument, match="number"):
+        call_each(-1)
