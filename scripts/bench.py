@@ -6,7 +6,7 @@ gpu    kernels, clouds, launches, pulls: kernels beside the CPU; many clouds and
 hand   fk, collision, codes, em: kinematics beside pytorch-kinematics, self-collision, inverse kinematics, learning
 load   plans, trials, points, starts, campaign, scheduler, waiting: memory over many plans and trials, of large inputs;
        what a million views cost; Dask's scheduler with a thousand workers, some of which die, and with waiting jobs
-plan   truth, fields, executable, certificates: the contact planner on the true surface and in exact arithmetic
+plan   truth, fields, executable, certificates, pace: contacts on the true surface, exact proofs, time to grasps
 scene  plane, click, rooms, real, whole, clutter, clear: depth images, and lifts among neighbours
 shape  objects, weaker: the estimated shape against true meshes
 

@@ -54,7 +54,7 @@ def plan_stacks(
     The problems of the next stack are prepared while the device plans. A refused problem, which is an empty set of
     grasps, stays as it is.
     """
-    most = 128  # clouds at once: a device plans more of them hardly faster, and their rows would fill its memory
+    most = 128  # clouds at once: of more the device would wait longer for the shapes
     budget = requests[0].time_budget if requests else None
     deadline = math.inf if budget is None else time.monotonic() + budget
     stack = _take(prepared, most)

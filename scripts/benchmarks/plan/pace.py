@@ -1,0 +1,86 @@
+"""How long a person waits for grasps on one core: for the first, for fifty, and for all of a view."""
+
+import math
+import time
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.common import Options, Row, bench
+from benchmarks.ground_truth import read_views
+from torchgrasp import ContactSpec, Hand, PointCloud, load_hand, load_object, stream_grasps
+
+FRICTIONS = (0.6, 0.8)
+BARS = {"first": 0.4, "first, worst decile": 1.0, "fifty": 1.2, "all": 2.2}
+"""Most CPU seconds of the Allegro hand from a cloud to grasps: medians but for the worst decile."""
+RATE = 110.0
+"""Least executable grasps for each CPU second."""
+
+
+class Pace(NamedTuple):
+    """CPU seconds until the first grasp, until fifty and until all, NaN if there are none, and the number of grasps."""
+
+    first: float
+    fifty: float
+    all: float
+    grasps: int
+
+
+@bench("plan/pace", objects=True)
+def keep_pace(o: Options) -> list[Row]:
+    """Plan on one view of each object at each friction, and time the batches; the first plan is not counted."""
+    rows = list[Row]()
+    for name in o.hands:
+        hand = load_hand(name)
+        plan_view(load_object("jug").view, hand, FRICTIONS[0], o)
+        views = read_views(o.objects[0], views=o.views)
+        seen = {one: cloud for one, _, cloud, _ in views if not o.names or one in o.names}
+        found = [plan_view(seen[x], hand, f, o) for x in tqdm(seen, disable=None, leave=False) for f in FRICTIONS]
+        rows += rows_of(name, len(seen), found)
+    return rows
+
+
+def plan_view(cloud: PointCloud, hand: Hand, friction: float, o: Options) -> Pace:
+    """Stream the grasps of a view, and return when they came."""
+    began, count, first, fifty = time.process_time(), 0, math.nan, math.nan
+    for grasps in stream_grasps(cloud, hand, ContactSpec(friction=friction, table=0.0), o.starts, o.seed):
+        now = time.process_time() - began
+        first = first if count else now
+        fifty = now if count < 50 <= count + len(grasps) else fifty
+        count += len(grasps)
+    return Pace(first, fifty, time.process_time() - began, count)
+
+
+def rows_of(hand: str, objects: int, found: list[Pace]) -> list[Row]:
+    """Return a row for each time and one for the rate; targets are those of the Allegro hand."""
+    first, fifty, every, count = np.array(found).T
+    times = {
+        "first": np.nanmedian(first),
+        "first, worst decile": np.nanquantile(first, 0.9),
+        "fifty": np.nanmedian(fifty),
+        "all": np.median(every),
+    }
+    what, known = f"{hand}, {objects} objects, friction {' and '.join(map(str, FRICTIONS))}", hand == "allegro"
+    rows = [
+        Row(
+            f"{what}: {name}",
+            f"{BARS[name]:g} s" if known else "-",
+            f"{x:.2f} s",
+            bool(x <= BARS[name]) if known else None,
+            {"s": float(x)},
+        )
+        for name, x in times.items()
+    ]
+    rate, empty = count.sum() / every.sum(), int((count == 0).sum())
+    text = f"{rate:.0f} for each CPU second; {empty} of {len(found)} plans have none"
+    return [
+        *rows,
+        Row(
+            f"{what}: executable grasps",
+            f"{RATE:g}" if known else "-",
+            text,
+            bool(rate >= RATE) if known else None,
+            {"rate": float(rate)},
+        ),
+    ]
