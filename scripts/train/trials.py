@@ -124,7 +124,7 @@ def run_trials(
     asked = {
         "torchgrasp": "campaign", "version": 1, "licence": "MIT", "hand": of_hand, "trials": trials,
         "protocol": dataclasses.asdict(PULL), "tasks": "drawn for each trial: train/tasks.py", "bodies": len(numbers),
-        "jobs_in_shard": 32, "versions": versions(),
+        "jobs_in_shard": 32, "versions": versions(), "device": "cpu",
     }  # fmt: skip
     rows = tuple(JobRow(f"body{k:05d}", "view0") for k in numbers)
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, model, 1))

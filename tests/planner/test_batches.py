@@ -190,6 +190,8 @@ def test_the_contact_sets_of_several_clouds_are_chosen_at_once_as_those_of_each_
     cost = torch.rand(40, generator=rng, dtype=torch.float64)
     cost[7], owner = torch.inf, torch.randint(clouds - 1, (40,), generator=rng) * 2  # the cloud in the middle has none
     together, alone = Pool(clouds), [Pool(1) for _ in range(clouds)]
+    together.add(offer(points[:0], []), cost[:0])
+    assert len(together.take(4).contacts) == 0
     for rows in (torch.arange(15), torch.arange(15, 40)):
         part = offer(points[rows], [[0.0]] * len(rows))
         together.add(part._replace(owner=owner[rows]), cost[rows])

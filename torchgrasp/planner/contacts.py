@@ -142,6 +142,8 @@ def _choose_of_each(
 
     Farthest-point sampling runs for all clouds at once, on their device.
     """
+    if not len(owner):
+        return owner
     table, held = _table(owner, clouds)
     least, order = torch.where(held, cost[table], torch.inf).sort(dim=1, stable=True)
     rows, likely = table.gather(1, order)[:, : LIKELY * most], torch.isfinite(least[:, : LIKELY * most])
@@ -165,7 +167,7 @@ def _choose_of_each(
 def _table(owner: Owner, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, "c m"]]:
     """Return the indices of the rows of each cloud, in their order, and a mask of the places that hold one."""
     count = torch.bincount(owner, minlength=clouds)
-    table = owner.new_zeros(clouds, int(count.max()) if len(owner) else 0)
+    table = owner.new_zeros(clouds, int(count.max()))
     table[owner, rank_in_group(owner)] = torch.arange(len(owner), device=owner.device)
     return table, torch.arange(table.shape[1], device=owner.device) < count[:, None]
 

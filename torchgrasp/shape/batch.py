@@ -95,7 +95,7 @@ class Walls(Value):
             found, group = torch.unique(wall, return_inverse=True)
             matrix = matrix[found]
         slot = rank_in_group(group)
-        padded = rows.new_zeros(len(matrix), int(torch.bincount(group).max()), rows.shape[1])
+        padded = rows.new_zeros(len(matrix), int(torch.bincount(group, minlength=1).max()), rows.shape[1])
         padded[group, slot] = rows
         return tuple(x[group, slot] for x in function(padded, matrix))
 

@@ -106,7 +106,7 @@ def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     objects = {"cup": {"views": views}, "jug": {"views": {"front": views["left"]}}, "loose": 5}
     (folder / "manifest.json").write_text(json.dumps({"objects": objects}))
 
-    def work(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str]) -> bytes:
+    def work(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str], *plan: object) -> bytes:
         found = records(torch.Generator().manual_seed(len(view.view)), 4, 2, protocol.noise.draws)
         row = JobRow(view.object, view.view, executable=2, points=4, grasps=2, passed=int(found.passed.sum()))
         return pack_shard(Shard((row,), found), meta)
