@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import dask
-from distributed import LocalCluster, get_worker
+from distributed import Client, LocalCluster, get_worker
 
 QUIET = {
     "distributed.logging.distributed": "critical",
@@ -41,6 +41,7 @@ def swarm(workers: int) -> Iterator[LocalCluster]:
             n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=60,
             memory_limit=0, executor=pool,
         ) as cluster,
+        Client(cluster, set_as_default=True),  # for the workers, which else share the client of one that may die
     ):  # fmt: skip
         yield cluster
     ThreadPoolExecutor.shutdown(pool, cancel_futures=True)
