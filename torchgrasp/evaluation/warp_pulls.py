@@ -15,8 +15,6 @@ from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
 from torchgrasp.geometry.frames import rotation_angle
 from torchgrasp.sim.warp_scene import WarpScenes
 
-BATCH = 1024  # trials that are simulated at once, which bounds the memory
-
 
 @checked
 def pull_grasps(
@@ -44,8 +42,9 @@ def pull_grasps(
     if len({id(trial.hand) for trial in trials}) != 1:
         raise BadArgument("trials", f"{len({id(trial.hand) for trial in trials})} hands", "trials of one hand")
     drivers, results = [TrialDriver(trial, protocol.trial) for trial in trials], list[PullResult]()
-    for first in range(0, len(drivers), BATCH):
-        results += pull_drivers(drivers[first : first + BATCH], protocol.pull, device)
+    batch = 1024  # trials that are simulated at once, which bounds the memory
+    for first in range(0, len(drivers), batch):
+        results += pull_drivers(drivers[first : first + batch], protocol.pull, device)
     return results
 
 

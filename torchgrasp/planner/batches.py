@@ -27,9 +27,6 @@ from torchgrasp.success.model import load_model
 from torchgrasp.success.order import by_success, grade, is_known, keep_promise, rank_by_variance
 from torchgrasp.values import ContactPlan, Grasps
 
-FIRST_STEPS = 8
-"""Most steps of the solver in the first batch; the second batch tries unsolved contact sets with all steps."""
-
 
 def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
     """Yield the grasps of each batch, as `Planner.run`; if none is likely to hold, plan with relaxed constraints, too.
@@ -148,7 +145,8 @@ class Planner:
         found, done = self.pool.take(tried), list[Owned]()
         first, self.first = self.first, False
         if first and not last:
-            solved, rest, failed = self._on_fixed_contacts(found, FIRST_STEPS)
+            few = 8  # most steps; the second batch tries unsolved contact sets with all steps
+            solved, rest, failed = self._on_fixed_contacts(found, few)
             without = self._without(solved)
             self.unfinished.append(_part(rest, failed, ~without))
             found, done = found.select(torch.nonzero(without[found.owner])[:, 0]), [solved]

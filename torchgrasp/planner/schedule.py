@@ -2,8 +2,7 @@
 
 from typing import NamedTuple
 
-FIRST, GROWTH = 8, 6
-"""Number of contact sets that the hand tries in the first batch, and ratio of the sizes of successive batches."""
+FIRST = 8  # contact sets that the hand tries in the first batch
 TRIED, TRIED_IN_SCENE = 250, 160
 """Most contact sets that the hand tries: fewer in a scene, because there it tries more postures for each set."""
 OFFERED = 4  # planned rows for each row that the hand tries
@@ -18,6 +17,7 @@ class Batch(NamedTuple):
 
 def schedule(starts: int, most: int) -> list[Batch]:
     """Return batches with `starts` guesses and `most` contact sets in all; a small remainder joins the last batch."""
+    growth = 6  # ratio of the sizes of successive batches
     batches, size, most = list[Batch](), FIRST, min(most, starts)
     tried = planned = 0
     while tried < most:
@@ -25,5 +25,5 @@ def schedule(starts: int, most: int) -> list[Batch]:
         tried += size
         further = min(starts, max(OFFERED * tried, starts * tried // most)) - planned
         batches.append(Batch(further, size))
-        planned, size = planned + further, GROWTH * size
+        planned, size = planned + further, growth * size
     return batches

@@ -13,8 +13,6 @@ from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.sim.mujoco_scene import OBJECT, MujocoScene, format_numbers, import_mujoco, scene_mjcf
 from torchgrasp.sim.scene_spec import SceneSpec
 
-CONTACTS, ROWS = 32, 192
-"""Near pairs of shapes of a world on average, and rows of constraints of each: a contact has at most four."""
 FIELDS = (
     "body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_subtreemass", "body_inertia",
     "body_invweight0", "dof_invweight0", "jnt_axis", "jnt_range", "actuator_acc0", "geom_dataid", "geom_size",
@@ -56,7 +54,8 @@ class WarpScenes:
     def _fill(self, positions: np.ndarray, controls: np.ndarray) -> None:
         """Allocate worlds at rest with the given positions (w, q) and targets of the motors (w, u)."""
         self._worlds = len(positions)
-        self._data = self._engine.make_data(self._scene.model, self._worlds, nconmax=CONTACTS, njmax=ROWS)
+        pairs, rows = 32, 192  # near pairs of shapes on average, rows of constraints: a contact has at most four
+        self._data = self._engine.make_data(self._scene.model, self._worlds, nconmax=pairs, njmax=rows)
         self._data.qpos.assign(positions)
         self._data.ctrl.assign(controls)
 
@@ -100,7 +99,7 @@ class WarpScenes:
     def object_poses(self) -> np.ndarray:
         """Return the poses (w, 4, 4) of the objects in the world's frame.
 
-        They are NaN where the simulation diverged, and where there was no room for all contacts (`CONTACTS`, `ROWS`).
+        They are NaN where the simulation diverged, and where there was no room for all contacts.
         """
         lost = self._engine.OverflowType
         left_out = self._data.overflow.numpy() & (lost.NEFC | lost.BROADPHASE | lost.NARROWPHASE | lost.CCD)
