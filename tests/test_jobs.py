@@ -118,7 +118,9 @@ def test_a_packed_value_holds_no_tensor_and_unpacks_to_the_same_value_with_its_c
     cloud = PointCloud(torch.rand(5, 3), None, torch.zeros(3))
     vars(cloud)["cached"] = torch.arange(3)
     value = {"clouds": [cloud, cloud], "batch": Batch(4, 2), "pair": (torch.tensor(2.5), "text"), "class": PointCloud}
-    packed = pickle.dumps(pack(value))
+    sent = pack(value)
+    assert sent["clouds"][0] is sent["clouds"][1]  # what is held twice is sent once
+    packed = pickle.dumps(sent)
     assert b"torch.Tensor" not in packed and b"_rebuild_tensor" not in packed
     found = unpack(pickle.loads(packed))  # noqa: S301 packed here
     assert torch.equal(found["clouds"][1].points, cloud.points) and found["clouds"][0].normals is None

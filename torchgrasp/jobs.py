@@ -157,13 +157,21 @@ class _Packed(NamedTuple):
     content: Any
 
 
-def pack(value: Any) -> Any:
-    """Return a value for another process: arrays in place of tensors, which processes would share; see `unpack`."""
+def pack(value: Any, known: dict[int, Any] | None = None) -> Any:
+    """Return a value for another process: arrays in place of tensors, which processes would share; see `unpack`.
+
+    `known` holds by identity what was packed before, so that what a value holds twice is sent once.
+    """
+    known = {} if known is None else known
+    if id(value) in known:
+        return known[id(value)]
     if isinstance(value, torch.Tensor):
-        return _Packed(str(value.device), value.detach().cpu().numpy())
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _Packed(type(value), pack(vars(value)))
-    return _map_items(pack, value)
+        packed = known[id(value)] = _Packed(str(value.device), value.detach().cpu().numpy())
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        packed = known[id(value)] = _Packed(type(value), pack(vars(value), known))
+    else:
+        packed = _map_items(lambda item: pack(item, known), value)
+    return packed
 
 
 def unpack(packed: Any) -> Any:
