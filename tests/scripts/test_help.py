@@ -43,7 +43,7 @@ def test_files_that_scripts_name_exist():
 
 def test_scripts_are_found():
     names = {path.stem for path in (*PYTHON, *SHELL)}
-    assert names >= {"bench", "demo", "docs", "package", "reproduce", "survey", "test", "train"}
+    assert names >= {"bench", "beside", "demo", "docs", "package", "reproduce", "survey", "test", "train"}
 
 
 def test_the_long_description_leads_nowhere_inside_the_project():
