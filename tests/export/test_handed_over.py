@@ -105,8 +105,10 @@ def test_moveit_gets_postures_pose_approach_and_quality(name):
     vectors = [message[key]["direction"]["vector"] for key in ("pre_grasp_approach", "post_grasp_retreat")]
     there, back = (np.array([v[k] for k in "xyz"]) for v in vectors)
     np.testing.assert_allclose(there, grasp.approach[0], atol=1e-8)
-    np.testing.assert_allclose(back, -there)
-    assert message["grasp_pose"]["header"] == {"frame_id": "object"}
+    np.testing.assert_array_equal(back, [0, 0, 1])  # up, off the table of the pinch
+    for key in ("pre_grasp_approach", "post_grasp_retreat"):
+        assert message[key]["min_distance"] < message[key]["desired_distance"] == 0.1
+    assert message["grasp_pose"]["header"] == {"frame_id": "object"} and message["allowed_touch_objects"] == ["object"]
 
 
 def test_every_number_of_the_yaml_is_a_number_and_graspgen_finds_transforms_and_mask():

@@ -78,28 +78,29 @@ def read_foreign(
     if path.suffix.lower() == ".npz":
         return _read_bench(path, hand, tuple(order), quaternion)
     file = read_json(path, _refuse, "a JSON file of grasps, or .npz")
-    if "grasps" in file.entries():
-        return _read_own(file.entries()["grasps"], hand)
+    if "grasps" in (fields := file.entries()):
+        names = fields["rename"].entries() if "rename" in fields else {}
+        return _read_own(fields["grasps"], hand, [names[j].text() if j in names else j for j in hand.joint_names])
     content, places = file.entries("pose", "dofs"), _places(hand, tuple(order))
     pose, dofs = _table(content["pose"], 7), _table(content["dofs"], len(order))
     if len(pose) != len(dofs):
         raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
-    return ForeignGrasps(torch.tensor(dofs[:, places]), _poses(pose, quaternion), None)
+    return ForeignGrasps(torch.tensor(dofs[:, places]), read_poses(pose, quaternion), None)
 
 
-def _read_own(rows: Field, hand: Hand) -> ForeignGrasps:
-    """Read grasps in the JSON format of `format_grasps`."""
+def _read_own(rows: Field, hand: Hand, names: list[str]) -> ForeignGrasps:
+    """Read grasps in the JSON format of `format_grasps`, whose actuated joints have `names`."""
     joints, opened, poses = list[list[float]](), list[list[float]](), list[list[float]]()
     for row in rows.items(MOST_GRASPS):
         fields = row.entries("joints", "pose")
         postures, pose = fields["joints"].entries("grasp", "pregrasp"), fields["pose"]
         for name, values in (("grasp", joints), ("pregrasp", opened)):
-            posture = postures[name].entries(*hand.joint_names)
-            values.append([posture[joint].number(-FAR, FAR) for joint in hand.joint_names])
+            posture = postures[name].entries(*names)
+            values.append([posture[joint].number(-FAR, FAR) for joint in names])
         place = pose.entries("position", "quaternion_wxyz")
         poses.append([*place["position"].numbers(3, -FAR, FAR), *place["quaternion_wxyz"].numbers(4, -FAR, FAR)])
     closed, pregrasp = (torch.tensor(x, dtype=torch.float64).reshape(-1, hand.dof) for x in (joints, opened))
-    return ForeignGrasps(closed, _poses(np.array(poses, dtype=float).reshape(-1, 7), "wxyz"), pregrasp)
+    return ForeignGrasps(closed, read_poses(np.array(poses, dtype=float).reshape(-1, 7), "wxyz"), pregrasp)
 
 
 def _table(field: Field, width: int) -> np.ndarray:
@@ -129,7 +130,7 @@ def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quat
     grasp, opened = rows["grasp_qpos"], rows.get("pregrasp_qpos")
     return ForeignGrasps(
         torch.tensor(grasp[:, 7:][:, places]),
-        _poses(grasp[:, :7], quaternion) @ bench_from_root,
+        read_poses(grasp[:, :7], quaternion) @ bench_from_root,
         None if opened is None else torch.tensor(opened[:, 7:][:, places]),
     )
 
@@ -143,7 +144,7 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
     return [order.index(name) for name in hand.joint_names]
 
 
-def _poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
+def read_poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
     """Return pose matrices from rows (g, 7) of a position [m] and a unit quaternion in the given order."""
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
     far = np.abs(np.linalg.norm(turns, axis=1) - 1) > 1e-3  # more than the rounding of a file of few digits

@@ -1,15 +1,16 @@
 """Export of grasps as postures of named joints: plain JSON, and keyframes of a MuJoCo model."""
 
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Force, Positive, checked
+from torchgrasp.checks import Force, Pose, Positive, checked
 from torchgrasp.control.forces import Squeeze, squeeze
 from torchgrasp.control.paper.closings import POSE_TIME
-from torchgrasp.errors import Status
+from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import format_json
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
@@ -28,7 +29,8 @@ CONVENTIONS = {
     "pose": "position p and unit quaternion (w, x, y, z) of the hand in the object's frame: x_object = R x_hand + p",
     "approach": "unit direction in the object's frame in which the opened hand comes to its pose, by the distance",
     "rise": "displacement of the hand from its pose until it closes, so that opened fingers are not in the table",
-    "joints": "by the names of the hand's URDF, all that move: actuated, coupled and parked",
+    "flange": "pose of the robot's flange in the object's frame, where the robot's was given",
+    "joints": "by the names of the hand's URDF or of `rename`, all that move: actuated, coupled and parked",
     "squeeze": "targets of position-controlled joints: stiffness (squeeze - grasp) = torque = J^T force",
     "force": "of the fingertip on the object at its contact, in the object's frame",
 }
@@ -36,13 +38,17 @@ CONVENTIONS = {
 
 
 @checked
-def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
+def format_grasps(
+    hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None,
+    rename: Mapping[str, str] | None = None, flange: Pose | None = None,
+) -> str:  # fmt: skip
     """Return grasps as JSON, together with `CONVENTIONS`, which explain the numbers.
 
     The hand moves along "approach" to "pose" and its "rise", in its "pregrasp" posture. It closes to "grasp" in the
     given time, and in the same time again it presses towards "squeeze". All joints move evenly. The strongest finger
     presses with a normal force of `force` [N]. `kp` is the stiffness of the robot's position control [N m/rad], by
-    default the hand's. Raises `BadArgument` for joints of another hand, or a force or stiffness that is not positive.
+    default the hand's. `rename` and `flange` are as in `format_moveit`; "flange" stands beside "pose". Raises
+    `BadArgument` for joints of another hand, unknown or equal names, or a force or stiffness that is not positive.
 
     >>> import json
     >>> from torchgrasp import load_hand
@@ -54,17 +60,20 @@ def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     grasps, path = grasps.to("cpu"), hand.urdf_path
     squeezed, postures = named_postures(hand, grasps, force, kp)
     opened = opened_pose(hand.to("cpu"), grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    names = rename_joints(hand, rename)
+    actuated = [names[joint] for joint in hand.joint_names]
     forces, std = rotate(grasps.obj_from_hand.double(), squeezed.forces), grasps.contacts.std_m
     rows = [
         {
             "rank": row,
             "status": Status(int(grasps.status[row])).name,
             "success": float(grasps.success[row]),
-            "pose": {"position": pose[:3, 3].tolist(), "quaternion_wxyz": quaternion(pose)},
+            "pose": describe_pose(pose),
+            **({} if flange is None else {"flange": describe_pose(pose.double() @ flange.double().cpu())}),
             "approach": {"direction": grasps.approach[row].tolist(), "distance": APPROACH_DISTANCE},
             "rise": (opened[row] - pose)[:3, 3].tolist(),
-            "joints": {name: {joint: float(q[row]) for joint, q in all_.items()} for name, all_ in postures.items()},
-            "torque": dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True)),
+            "joints": {name: {names[joint]: float(q[joint][row]) for joint in names} for name, q in postures.items()},
+            "torque": dict(zip(actuated, squeezed.torques[row].tolist(), strict=True)),
             "contacts": [
                 {
                     "finger": finger,
@@ -87,8 +96,9 @@ def format_grasps(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
         "version": 3,  # version 1 had no approach, version 2 no rise
         **CONVENTIONS,
         "hand": {"name": hand.name, "urdf": path.name, "root": read_urdf(path).root, "sha256": hand.source.sha256},
-        "actuated": list(hand.joint_names),
-        "stiffness": {name: drive.kp if kp is None else kp for name, drive in hand.actuators.items()},
+        "actuated": actuated,
+        "rename": dict(rename or {}),
+        "stiffness": {names[joint]: drive.kp if kp is None else kp for joint, drive in hand.actuators.items()},
         "strongest_normal_force": force,
         "time": {"pregrasp": 0.0, "grasp": POSE_TIME, "squeeze": 2 * POSE_TIME},
         "provenance": grasps.meta,
@@ -105,6 +115,22 @@ def named_postures(
     squeezed = squeeze(hand, grasps, force, kp)
     postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}
     return squeezed, {name: hand.expand(joints) for name, joints in postures.items()}
+
+
+def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str]:
+    """Return the robot's name of each joint of the URDF: those of `rename` first, in its order. Refuse equal names."""
+    given, ours = dict(rename or {}), hand.tree.joint_names
+    if unknown := [joint for joint in given if joint not in ours]:
+        raise BadArgument("rename", repr(unknown[0]), f"a joint of the hand: {', '.join(ours)}")
+    names = given | {joint: joint for joint in ours if joint not in given}
+    if "" in names.values() or len(set(names.values())) < len(names):
+        raise BadArgument("rename", ", ".join(names.values()), "a name for each joint")
+    return names
+
+
+def describe_pose(a_from_b: Float[Tensor, "4 4"]) -> dict[str, list[float]]:
+    """Return a pose as position [m] and unit quaternion (w, x, y, z), by name."""
+    return {"position": a_from_b[:3, 3].tolist(), "quaternion_wxyz": quaternion(a_from_b)}
 
 
 def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:

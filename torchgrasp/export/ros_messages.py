@@ -1,7 +1,7 @@
 """Export of grasps as ROS 2 messages in YAML: moveit_msgs/Grasp and trajectory_msgs/JointTrajectory."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import torch
@@ -9,13 +9,13 @@ import yaml
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Force, Positive, checked
+from torchgrasp.checks import Force, Pose, Positive, checked
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.errors import BadArgument
-from torchgrasp.export.postures import named_postures, quaternion
+from torchgrasp.export.postures import named_postures, quaternion, rename_joints
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
+from torchgrasp.ik.motion import APPROACH_DISTANCE, UP, opened_pose
 from torchgrasp.values import Grasps
 
 OBJECT_FRAME = "object"
@@ -38,16 +38,26 @@ _Dumper.add_representer(float, _Dumper.represent_number)
 
 
 @checked
-def format_moveit(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
+def format_moveit(
+    hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None,
+    rename: Mapping[str, str] | None = None, flange: Pose | None = None, object_id: str = OBJECT_FRAME,
+) -> str:  # fmt: skip
     """Return grasps as a YAML list of moveit_msgs/Grasp.
 
-    `grasp_pose` is the pose of the root link of the hand's URDF in `OBJECT_FRAME`: attach the end-effector there. The
+    `grasp_pose` is the pose in `OBJECT_FRAME` of the root link of the hand's URDF, or of a robot's flange. The
     pre-grasp posture has positions; the grasp posture closes to the contacts, then to targets that press, with the
-    torques [N m] as effort. `grasp_quality` is the predicted success. The retreat is opposite to the approach. `force`
-    [N] is the normal force of the strongest finger. `kp` is the stiffness of the robot's own position control [N
-    m/rad], by default the hand's. Raises `BadArgument` for joints of another hand, a force or stiffness that is not
-    positive, or a grasp whose hand goes down while it closes (`opened_pose`), which a message with one pose cannot
-    tell.
+    torques [N m] as effort. `grasp_quality` is the predicted success. The retreat is up: the normal of the plan's
+    table, or z.
+
+    Args:
+        force: normal force of the strongest finger [N].
+        kp: stiffness of the robot's own position control [N m/rad]; by default the hand's.
+        rename: the robot's names of joints, by their names in the URDF; these joints come first, in this order.
+        flange: pose of the robot's flange in the frame of the root link.
+        object_id: id of the object in the planning scene, which the hand may touch.
+
+    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, unknown or equal names,
+    or a grasp whose hand goes down while it closes (`opened_pose`), which a message with one pose cannot tell.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -56,6 +66,8 @@ def format_moveit(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
     # the hand's frame is link 'palm' of hand.urdf; joints in the order of joint_names
     """
     hand, grasps = hand.to("cpu"), grasps.to("cpu")
+    up = UP if grasps.table is None else grasps.table.normal
+    poses = grasps.obj_from_hand.double() if flange is None else grasps.obj_from_hand.double() @ flange.double().cpu()
     if not torch.equal(opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table), grasps.obj_from_hand):
         raise BadArgument("grasps", "a hand that goes down while it closes", "hands that close at one pose")
     messages = [
@@ -63,20 +75,23 @@ def format_moveit(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive |
             "id": f"grasp_{row}",
             "pre_grasp_posture": trajectory | {"points": trajectory["points"][:1]},
             "grasp_posture": trajectory | {"points": trajectory["points"][1:]},
-            "grasp_pose": {"header": {"frame_id": OBJECT_FRAME}, "pose": _pose(grasps.obj_from_hand[row])},
+            "grasp_pose": {"header": {"frame_id": OBJECT_FRAME}, "pose": _pose(poses[row])},
             "grasp_quality": float(grasps.success[row]),
             "pre_grasp_approach": _translation(grasps.approach[row]),
-            "post_grasp_retreat": _translation(-grasps.approach[row]),
+            "post_grasp_retreat": _translation(up),
             "max_contact_force": force,
-            "allowed_touch_objects": [],
+            "allowed_touch_objects": [object_id],
         }
-        for row, trajectory in enumerate(_trajectories(hand, grasps, force, kp))
+        for row, trajectory in enumerate(_trajectories(hand, grasps, force, kp, rename))
     ]
-    return _document(hand, "a list of moveit_msgs/Grasp", [messages])
+    of = "" if flange is None else ", whose poses are of the flange"
+    return _document(hand, f"a list of moveit_msgs/Grasp{of}", [messages])
 
 
 @checked
-def format_trajectories(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
+def format_trajectories(
+    hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None, rename: Mapping[str, str] | None = None
+) -> str:
     """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp: pre-grasp, grasp, squeeze.
 
     The hand must already be at its pose, which `format_moveit` and `format_grasps` give. Arguments and errors are those
@@ -88,13 +103,16 @@ def format_trajectories(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Posi
     >>> text.count("time_from_start")
     3
     """
-    return _document(hand, "a trajectory_msgs/JointTrajectory for each grasp", _trajectories(hand, grasps, force, kp))
+    what, documents = "a trajectory_msgs/JointTrajectory for each grasp", _trajectories(hand, grasps, force, kp, rename)
+    return _document(hand, what, documents)
 
 
-def _trajectories(hand: Hand, grasps: Grasps, force: float, kp: float | None) -> Iterator[dict[str, Any]]:
+def _trajectories(
+    hand: Hand, grasps: Grasps, force: float, kp: float | None, rename: Mapping[str, str] | None
+) -> Iterator[dict[str, Any]]:
     """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dict, with all joints of the hand."""
     squeezed, postures = named_postures(hand, grasps, force, kp)
-    names, root = list(hand.tree.joint_names), read_urdf(hand.urdf_path).root
+    names, root = rename_joints(hand, rename), read_urdf(hand.urdf_path).root
     for row in range(len(grasps)):
         torque = dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True))
         efforts = [], [], [torque.get(joint, 0.0) for joint in names]
@@ -106,7 +124,7 @@ def _trajectories(hand: Hand, grasps: Grasps, force: float, kp: float | None) ->
             }
             for k, (posture, effort) in enumerate(zip(postures.values(), efforts, strict=True))
         ]
-        yield {"header": {"frame_id": root}, "joint_names": names, "points": points}
+        yield {"header": {"frame_id": root}, "joint_names": list(names.values()), "points": points}
 
 
 def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
@@ -117,10 +135,10 @@ def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
 
 
 def _translation(direction: Float[Tensor, "3"]) -> dict[str, Any]:
-    """Return a moveit_msgs/GripperTranslation along `direction`, as a dict; its distance is that of the approach."""
+    """Return a moveit_msgs/GripperTranslation, as a dict: as far as the approach, of which half must be free."""
     vector = dict(zip("xyz", direction.tolist(), strict=True))
     stamped = {"header": {"frame_id": OBJECT_FRAME}, "vector": vector}
-    return {"direction": stamped, "desired_distance": APPROACH_DISTANCE, "min_distance": APPROACH_DISTANCE}
+    return {"direction": stamped, "desired_distance": APPROACH_DISTANCE, "min_distance": APPROACH_DISTANCE / 2}
 
 
 def _document(hand: Hand, what: str, documents: Iterable[Any]) -> str:

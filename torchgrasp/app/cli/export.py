@@ -1,9 +1,13 @@
 """The commands `torchgrasp export` and `torchgrasp import`: grasps in the formats of other programs."""
 
+import functools
+import inspect
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, get_args
+
+import numpy as np
 
 from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
@@ -11,9 +15,9 @@ from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
 from torchgrasp.checks import Count
 from torchgrasp.cloud import read_cloud
 from torchgrasp.cloud.agreement import check_agreement
-from torchgrasp.errors import BadArgument, Status
-from torchgrasp.export.foreign import Quaternion
-from torchgrasp.files import write_file
+from torchgrasp.errors import BadArgument, ModelFileError, Status
+from torchgrasp.export.foreign import Quaternion, read_poses
+from torchgrasp.files import read_json, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.problem import digest
@@ -30,7 +34,7 @@ TEXTS: dict[str, Callable[..., str]] = {
 """Writers of formats that are one text file and do not name the object."""
 
 
-@arguments(path="out", folder="out", object_path="object", name="hand", fingers="grasps")
+@arguments(path="out", folder="out", object_path="object", name="hand", fingers="grasps", object_id="object")
 class Export(Command):
     """Write the best executable grasps of a file for other programs, with frames and the order of joints."""
 
@@ -47,13 +51,30 @@ class Export(Command):
     kp: float | None = option(
         None, "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's"
     )
-    object: str | None = option(None, "dexgraspbench: its folder of the object; graspgen: the mesh in its data set")
+    object: str | None = option(
+        None, "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the object's id"
+    )
+    rename: tuple[str, ...] = option(
+        (), "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file of such an object"
+    )
+    flange: tuple[float, float, float, float, float, float, float] | None = option(
+        None,
+        "json, moveit: position [m] and quaternion wxyz of the robot's flange in the hand's frame, to write its pose",
+    )
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return the exit code."""
-        if (self.object is None) == (self.format in ("dexgraspbench", "graspgen")):
-            wanted = "a path with --format dexgraspbench or graspgen, and with these alone"
+        named = self.format in ("dexgraspbench", "graspgen")
+        if (self.object is None) == named and self.format != "moveit":
+            wanted = "a path with --format dexgraspbench or graspgen, or an id with moveit, and with these alone"
             raise BadArgument("--object", self.object, wanted)
+        with naming(path="--flange"):
+            flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
+        robot = {"rename": read_names(self.rename), "flange": flange, "object_id": None if named else self.object}
+        robot = {name: x for name, x in robot.items() if x is not None}
+        taken = inspect.signature(TEXTS[self.format]).parameters if self.format in TEXTS else ()
+        if unused := [name for name in robot if name not in taken]:
+            raise BadArgument(f"--{unused[0]}", f"--format {self.format}", "a format that it is for")
         with naming(path="GRASPS"):
             planned = load_grasps(self.grasps)
         hand = hand_of(planned, self.hand)
@@ -68,9 +89,17 @@ class Export(Command):
             elif self.format == "graspgen":
                 write_file(self.out, formats.format_graspgen(best, str(self.object)))
             else:
-                write_file(self.out, TEXTS[self.format](hand, best, self.force, self.kp))
+                write_file(self.out, TEXTS[self.format](hand, best, self.force, self.kp, **robot))
         print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
         return 0 if len(best) else 1
+
+
+def read_names(words: Sequence[str]) -> dict[str, str] | None:
+    """Return names of joints, given as texts URDF=ROBOT or as the path of a .json file with an object of them."""
+    if len(words) != 1 or "=" in words[0]:
+        return {joint: name for joint, _, name in (word.partition("=") for word in words)} or None
+    file = read_json(Path(words[0]), functools.partial(ModelFileError, "rename"), "URDF=ROBOT, or a JSON file of names")
+    return {joint: name.text() for joint, name in file.entries().items()}
 
 
 @arguments(order="joints", pregrasp="file", obj_from_hand="file", std_m="std")
