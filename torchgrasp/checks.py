@@ -51,8 +51,7 @@ class _Call:
 
     def check_numbers(self) -> None:
         """Raise `BadArgument` if a tensor to test has NaN or infinity, or a transform to test is not rigid."""
-        tests = (self.finite, torch.isfinite, "finite numbers"), (self.rigid, is_rigid, RIGID)
-        for tensors, test, allowed in tests:
+        for tensors, test, allowed in ((self.finite, torch.isfinite, "finite numbers"), (self.rigid, is_rigid, RIGID)):
             for name, x in tensors.items():
                 if is_known(x) and not bool((good := test(x)).all()):
                     first = tuple(torch.nonzero(~good)[0].tolist())
@@ -286,8 +285,11 @@ def _hints(thing: Any) -> dict[str, Any]:
 
 
 def _option(hint: Any, key: str) -> Any:
-    """Return the type annotation of the keyword argument `key` of `**options`."""
-    return _hints(typing.get_args(hint)[0]).get(key, Any) if typing.get_origin(hint) is Unpack else hint
+    """Return the type annotation of the keyword argument `key` of `**options`; raise `TypeError` if there is none."""
+    options = _hints(typing.get_args(hint)[0]) if typing.get_origin(hint) is Unpack else {key: hint}
+    if key not in options:
+        raise TypeError(f"got an unexpected keyword argument {key!r}: expected one of {', '.join(options)}")
+    return options[key]
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:

@@ -11,6 +11,7 @@ from typing import Any
 
 from jaxtyping import Int
 from torch import Tensor
+from typing_extensions import Unpack
 
 from torchgrasp.base import Value, count_status
 from torchgrasp.checks import Count, Seed, checked
@@ -19,7 +20,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.batches import Planner, rank_together
 from torchgrasp.planner.changes import Change, list_changes, more_starts
 from torchgrasp.planner.problem import Problem
-from torchgrasp.planner.request import Observer, Request, ignore
+from torchgrasp.planner.request import Observer, PlanOptions, Request, show_options
 from torchgrasp.planner.run import expected_success
 from torchgrasp.planner.stack import Stack
 from torchgrasp.scene.scene import Scene
@@ -168,6 +169,7 @@ class Explanation(Value):
         return f"{self.funnel}\n{self.advice}"
 
 
+@show_options
 @checked
 @single_threaded
 def explain_empty(
@@ -176,7 +178,7 @@ def explain_empty(
     spec: ContactSpec | None = None,
     starts: Count = 1000,
     seed: Seed = 0,
-    **options: Any,
+    **options: Unpack[PlanOptions],
 ) -> Explanation:
     """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
 
@@ -204,7 +206,7 @@ def explain_empty(
     request = Request(cloud, hand, spec, starts, seed, **options)
     deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
     few = dataclasses.replace(request, starts=min(starts, starts_tried))
-    funnel, _, problem = try_request(few, first=request.observer)
+    funnel, _, problem = try_request(few, first=request.tell)
     trials, left, plans = list[Trial](), 0, MOST_TRIALS - 2 * (len(few.hands) - 1)  # each set needs a library
     more = more_starts(request)
     for change in [] if funnel.executable else [*order_changes(list_changes(few), funnel), more]:
@@ -217,7 +219,7 @@ def explain_empty(
             continue
         found, expected, _ = try_request(change.request, None if change.refit else problem)
         trials.append(Trial(change.words, change.choice, found.executable, expected, found))
-        request.observer("change", str(trials[-1]), trials[-1])
+        request.tell("change", str(trials[-1]), trials[-1])
     trials.sort(
         key=lambda trial: (-round(trial.expected, 1), -bool(trial.executable), not trial.choice, -trial.expected)
     )
@@ -244,7 +246,7 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
 
 
 def try_request(
-    request: Request, known: Problem | None = None, first: Observer = ignore
+    request: Request, known: Problem | None = None, first: Observer | None = None
 ) -> tuple[Funnel, float, Problem]:
     """Plan a request with a small library of postures; return the losses, the expected success, and the problem.
 
@@ -264,7 +266,7 @@ def try_request(
         for tried in itertools.chain((problem,), relaxed):
             grasps = rank_together([batch for (batch,) in Planner(Stack.of([tried])).run(math.inf)], request.order)
             funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
-            if not found:
+            if not found and first is not None:
                 first("funnel", str(funnel.worst), funnel)
             found.append((funnel, expected_success(grasps, max(starts // 5, 1))))
             if funnel.stages[0].kept:

@@ -9,7 +9,7 @@ from torchgrasp.checks import Count, Range, Seed, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.many import plan_many
-from torchgrasp.planner.request import Budget, PlanOptions, Request
+from torchgrasp.planner.request import PlanOptions, Request, show_options
 from torchgrasp.planner.run import plan_request, stream_request
 from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
@@ -19,14 +19,15 @@ from torchgrasp.values import Grasps, PointCloud
 
 @overload
 def plan_grasps(
-    cloud: PointCloud | Scene, hand: Hand, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0, *,
-    time_budget: Budget | None = None, **options: Unpack[PlanOptions],
+    cloud: PointCloud | Scene, hand: Hand, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0,
+    **options: Unpack[PlanOptions],
 ) -> Grasps: ...  # fmt: skip
 @overload
 def plan_grasps(
     cloud: Sequence[PointCloud], hand: Hand, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0, *,
-    time_budget: Budget | None = None, workers: Annotated[int, Range(0, 1024)] = 0, **options: Unpack[PlanOptions],
+    workers: Annotated[int, Range(0, 1024)] = 0, **options: Unpack[PlanOptions],
 ) -> list[Grasps]: ...  # fmt: skip
+@show_options
 @checked
 @single_threaded
 def plan_grasps(
@@ -36,38 +37,37 @@ def plan_grasps(
     starts: Count = 1000,
     seed: Seed = 0,
     *,
-    time_budget: Budget | None = None,
     workers: Annotated[int, Range(0, 1024)] = 0,
     **options: Unpack[PlanOptions],
 ) -> Grasps | list[Grasps]:
-    """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene.
+    """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene, the best grasp first.
 
-    The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps clear of the target's
-    neighbours and of space that is probably full. The remaining risk of collision lowers `Grasps.success`.
-
-    Grasps are planned in batches, each larger than the one before. `stream_grasps` yields each batch when it ends.
+    >>> from torchgrasp import load_hand, load_object
+    >>> grasps = plan_grasps(load_object("cylinder").view, load_hand("barrett"), ContactSpec(table=0.0), starts=20)
+    >>> grasps.joints.shape[1]
+    4
 
     Args:
         cloud: points that a camera saw [m]; missing normals and viewpoint are estimated. Or a `Scene` with a target. A
-            sequence of clouds gives a list of results; on a GPU the clouds are planned at once. A bad cloud gives no
-            grasps, and `meta["refused"]` holds the reason.
+            sequence of clouds gives a list of results; a bad cloud has none, and `meta["refused"]` holds the reason.
         hand: from `load_hand`; it is moved to the device of the cloud.
         spec: the constraints on contacts; by default `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
-        time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of planned guesses.
-        workers: number of processes for a sequence of clouds; 0 means this process. On a GPU they estimate the shapes.
+        workers: number of processes for a sequence of clouds; 0 means this process. On a GPU, which plans all clouds at
+            once, they estimate the shapes.
         fingers: the fingers that grasp, as in `load_hand`; by default those of `hand`. "auto" chooses, of the sets that
             the hand declares, the one with the greatest expected success. `hand_of` loads the hand of the result.
-        mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.
-        ranking: criterion by which grasps are ordered, see `Ranking`; by default "success", in mode "paper" "variance".
         task: what the grasps must do, for which their success is predicted; by default `GraspTask()`.
         promise: share of the returned grasps that must hold, or None; less sure grasps get the status `NO_PROMISE`.
             `meta["promise"]` says which trials chose the bound (`torchgrasp.success.promise`).
-        shape: the object's shape if it is known better than the cloud shows, as after a touch (`ShapeGP.update`).
-        observer: function that is called after each stage with the stage's name, a line of text and its result.
         reachable: function that returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4) an arm reaches, in
             the frame of the cloud; by default all poses are reachable.
+        mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.
+        ranking: criterion by which grasps are ordered, see `Ranking`; by default "success", in mode "paper" "variance".
+        time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of planned guesses.
+        shape: the object's shape if it is known better than the cloud shows, as after a touch (`ShapeGP.update`).
+        observer: function that is called after each stage with the stage's name, a line of text and its result.
 
     Returns:
         Grasps: executable grasps (`Status.OK`) first, best first. `explain_empty` explains an empty result.
@@ -77,13 +77,11 @@ def plan_grasps(
             without a target; `shape`, `observer` or `reachable` beside several clouds.
         MissingExtra: pebble is not installed, for workers.
 
-    >>> from torchgrasp import load_hand, load_object
-    >>> view = load_object("cylinder").view
-    >>> grasps = plan_grasps(view, load_hand("barrett"), starts=20)
-    >>> grasps.joints.shape[1]
-    4
+    The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps clear of the target's
+    neighbours and of space that is probably full. The remaining risk of collision lowers `Grasps.success`. Grasps are
+    planned in batches, each larger than the one before. `stream_grasps` yields each batch when it ends.
     """
-    given = {"hand": hand, "spec": spec, "starts": starts, "seed": seed, "time_budget": time_budget, **options}
+    given = {"hand": hand, "spec": spec, "starts": starts, "seed": seed, **options}
     if isinstance(cloud, Sequence):
         return plan_many(cloud, workers, given)
     if workers:
@@ -91,6 +89,7 @@ def plan_grasps(
     return plan_request(Request(cloud, **given))
 
 
+@show_options
 @checked
 @single_threaded
 def stream_grasps(

@@ -22,7 +22,7 @@ from torchgrasp.ik.candidates import Reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
 from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, settle_flatness
-from torchgrasp.planner.request import Request, ignore
+from torchgrasp.planner.request import Request
 from torchgrasp.planner.schedule import TRIED, TRIED_IN_SCENE, Batch, schedule
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
@@ -184,7 +184,7 @@ class Problem:
 
     def tell(self, stage: str, message: str, value: Any) -> None:
         """Report a stage to the observer, with the result of the stage in the caller's frame."""
-        if self.request.observer is not ignore:
+        if self.request.observer is not None:
             self.request.observer(stage, message, self._moved(value))
 
     def give_back(self, grasps: Grasps) -> Grasps:

@@ -9,7 +9,6 @@ from torchgrasp.base import count_status, join
 from torchgrasp.errors import Status
 from torchgrasp.ik.attempts import executable
 from torchgrasp.planner.problem import Problem
-from torchgrasp.planner.request import ignore
 from torchgrasp.shape.values import surface_deviation
 from torchgrasp.values import Grasps, format_success
 
@@ -20,7 +19,7 @@ class Report:
     def __init__(self, problem: Problem, batches: int, planned: int) -> None:
         """Take the number of all `batches`, and the number `planned` of those batches that plan new initial guesses."""
         self.problem, self.batches, self.planned = problem, batches, planned
-        self.heard = problem.request.observer is not ignore  # without an observer nothing is stored or counted
+        self.heard = problem.request.observer is not None  # without an observer nothing is stored or counted
         self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
         self.ended = self.offered = self.closed = 0
 

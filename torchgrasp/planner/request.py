@@ -1,9 +1,12 @@
 """The request: the checked arguments of `plan_grasps`."""
 
 import dataclasses
+import inspect
 import math
+import re
+import typing
 from collections.abc import Callable
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, TypedDict, TypeVar
 
 from torchgrasp.checks import Count, Range, Seed, checked
 from torchgrasp.errors import BadArgument
@@ -25,26 +28,34 @@ Observer = Callable[[str, str, Any], None]
 """Function that is called after each stage with the stage's name, a line of text, and the stage's result."""
 
 
-def ignore(stage: str, message: str, value: Any) -> None:
-    """Ignore the report of a planning stage: the observer that is called by default."""
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class PlanOptions(TypedDict, total=False):
-    """The types of the optional keyword arguments of `plan_grasps`, which explains them.
+class SceneOptions(TypedDict, total=False):
+    """The types of the optional keyword arguments of `plan_grasps` that `plan_scene` has, too.
+
+    >>> options: SceneOptions = {"fingers": 4}  # plan_scene(scene, hand, **options)
+    """
+
+    fingers: Fingers | None
+    task: GraspTask | None
+    promise: Promised | None
+    reachable: Reachable | None
+
+
+class PlanOptions(SceneOptions, total=False):
+    """The types of the optional keyword arguments of `plan_grasps`, which explains them; `Request` has the defaults.
 
     >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
     >>> sorted(options)
     ['fingers', 'ranking']
     """
 
-    fingers: Fingers | None
     mode: Mode
     ranking: Ranking | None
-    task: GraspTask | None
-    promise: Promised | None
+    time_budget: Budget | None
     shape: ShapeGP | None
-    observer: Observer
-    reachable: Reachable | None
+    observer: Observer | None
 
 
 @checked
@@ -63,7 +74,7 @@ class Request:
     task: GraspTask | None = None
     promise: Promised | None = None
     shape: ShapeGP | None = None
-    observer: Observer = ignore
+    observer: Observer | None = None
     reachable: Reachable | None = None
     time_budget: Budget | None = None
 
@@ -71,6 +82,11 @@ class Request:
         """Raise `BadArgument` for a promise about an object that may be elsewhere, which no trials support."""
         if self.promise is not None and self.grasp_task.displaced:
             raise BadArgument("promise", f"{self.promise:g} for a displaced object", "None")
+
+    def tell(self, stage: str, message: str, value: Any) -> None:
+        """Report the result of a stage to the observer, if there is one."""
+        if self.observer is not None:
+            self.observer(stage, message, value)
 
     @property
     def contact_spec(self) -> ContactSpec:
@@ -93,6 +109,26 @@ class Request:
     def hands(self) -> tuple[Hand, ...]:
         """One hand for each set of fingers that may grasp."""
         return finger_sets(self.hand, self.fingers, self.mode)
+
+
+class _Plain(str):
+    """A text that a signature shows without quotes."""
+
+    __repr__ = str.__str__
+
+
+def show_options(function: Function) -> Function:
+    """Return the function, whose signature names each option in place of `**options`, and each type in plain words."""
+    signature, hints = inspect.signature(function), typing.get_type_hints(function)
+    inner = typing.get_type_hints(typing.get_args(hints.pop("options"))[0])
+    defaults = {field.name: field.default for field in dataclasses.fields(Request)}
+    named = [one for one in signature.parameters.values() if one.name in hints]
+    named += [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name]) for name in inner]
+    words = {k: _Plain(re.sub(r"\b(\w+\.)+", "", inspect.formatannotation(x))) for k, x in (hints | inner).items()}
+    parameters = [one.replace(annotation=words[one.name]) for one in named]
+    shown = signature.replace(parameters=parameters, return_annotation=words["return"])
+    setattr(function, "__signature__", shown)  # noqa: B010
+    return function
 
 
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:

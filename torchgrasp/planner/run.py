@@ -39,7 +39,7 @@ def stream_request(request: Request) -> Iterator[Grasps]:
 def finish(request: Request, batches: list[Grasps]) -> Grasps:
     """Rank the grasps of all batches together, report them to the observer, and return them."""
     grasps = rank_together(batches, request.order)
-    request.observer("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
+    request.tell("refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps)
     return grasps
 
 
@@ -61,7 +61,7 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
     All sets share the remaining time. The observer is called with "fingers" after each set, then with the stages of the
     best set.
     """
-    best, observer = None, problem.request.observer
+    best, asked = None, problem.request
     for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
         stages = list[tuple[str, str, Any]]()
         request = dataclasses.replace(problem.request, observer=lambda *stage: stages.append(stage))  # noqa: B023 at once
@@ -70,12 +70,12 @@ def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Gr
         batches = list(plan_hand(problem, now + (deadline - now) / left))
         grasps = problem.give_back(rank_together(batches, problem.request.order))
         expected, count = expected_success(grasps), int((grasps.status == Status.OK).sum())
-        observer("fingers", f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected", grasps)
+        asked.tell("fingers", f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected", grasps)
         if best is None or expected > best[0]:
             best = expected, grasps, stages
     assert best is not None
     for stage in best[2]:
-        observer(*stage)
+        asked.tell(*stage)
     return best[1]
 
 

@@ -6,20 +6,19 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from typing_extensions import Unpack
+
 from torchgrasp.base import Value
 from torchgrasp.checks import Count, Fraction, Measured, Seed, checked
 from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.hand_toml import Fingers
-from torchgrasp.ik.candidates import Reachable
 from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.request import PlanOptions, Promised, finger_sets
+from torchgrasp.planner.request import SceneOptions, finger_sets, show_options
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec
-from torchgrasp.success.task import GraspTask
 from torchgrasp.threads import single_threaded
 from torchgrasp.values import Grasps
 
@@ -65,6 +64,7 @@ class ScenePlan(Value):
         return next((thing for thing in self.things if thing.grasps is not None), None)
 
 
+@show_options
 @checked
 @single_threaded
 def plan_scene(
@@ -74,11 +74,8 @@ def plan_scene(
     starts: Count = 1000,
     seed: Seed = 0,
     *,
-    fingers: Fingers | None = None,
     enough: Fraction = 1.0,
-    reachable: Reachable | None = None,
-    task: GraspTask | None = None,
-    promise: Promised | None = None,
+    **options: Unpack[SceneOptions],
 ) -> ScenePlan:
     """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
@@ -93,9 +90,8 @@ def plan_scene(
         spec: the constraints on contacts; `ContactSpec()` by default.
         starts: number of random initial guesses of the contact planner for each object.
         seed: random seed.
-        fingers: see `plan_grasps`; "auto" chooses fingers for each object. `hand_of` loads the hand of grasps.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.
-        reachable, task, promise: see `plan_grasps`.
+        options: see `plan_grasps`; `fingers` "auto" chooses for each object. `hand_of` loads the hand of grasps.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)
@@ -104,8 +100,7 @@ def plan_scene(
     """
     if not scene.things:
         raise BadArgument("scene", "no object on the table", "a scene with at least one object")
-    finger_sets(hand, fingers)  # raises for unknown fingers
-    options: PlanOptions = {"fingers": fingers, "reachable": reachable, "task": task, "promise": promise}
+    finger_sets(hand, options.get("fingers"))  # raises for unknown fingers
     plan = functools.partial(plan_grasps, hand=hand, spec=spec, starts=starts, seed=seed, **options)
     plans: list[ThingPlan] = []
     judged = judge_things(scene, hand, spec)
