@@ -262,9 +262,19 @@ def test_view_opens_the_page_of_a_folder_or_names_what_is_missing(tmp_path, caps
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
     assert cli.main(["view", str(tmp_path)]) == 2 and "FOLDER: expected" in capsys.readouterr().err
+    assert cli.main(["view", "jug"]) == 2 and "torchgrasp grasp CLOUD --out jug" in capsys.readouterr().err
     (tmp_path / "view.html").write_text("")
     assert cli.main(["view", str(tmp_path), "--no-browser"]) == 0 and opened == []
     assert cli.main(["view", str(tmp_path)]) == 0 and opened == [(tmp_path / "view.html").as_uri()]
+    assert "No browser was found" in capsys.readouterr().out  # `append` returns None, as a machine without a browser
+    (tmp_path / "grasps.safetensors").write_text("")
+    assert cli.main(["view", str(tmp_path / "grasps.safetensors")]) == 0 and opened[1] == opened[0]
+    (tmp_path / "out" / "jug").mkdir(parents=True)
+    mine, jug = tmp_path / "mine.html", tmp_path / "out" / "jug" / "view.html"
+    monkeypatch.chdir(tmp_path)
+    for asked, page in (("mine.html", mine), ("jug", jug)):
+        page.write_text("")
+        assert cli.main(["view", asked]) == 0 and opened[-1] == page.as_uri()
 
 
 def test_the_bare_command_shows_where_to_begin_and_help_lists_every_command_in_a_chapter(capsys):

@@ -133,6 +133,9 @@ def test_a_drag_turns_and_the_wheel_zooms(visit):
 
 
 def test_the_slider_of_the_shell_follows_mouse_and_keys(visit):
+    visit.page.get_by_label("hand", exact=True).uncheck()
+    visit.page.mouse.move(*visit.middle())
+    visit.page.mouse.wheel(0, -400)
     first = visit.until_drawn()
     slider = visit.page.locator("#sigma")
     box = slider.bounding_box()
@@ -143,6 +146,7 @@ def test_the_slider_of_the_shell_follows_mouse_and_keys(visit):
     assert 2.3 < float(visit.state()["sigma"]) < 2.8 and visit.state()["grasp"] == "1"
     slider.press("Home")
     assert visit.state()["sigma"] == "0"
+    visit.page.get_by_label("hand", exact=True).check()
 
 
 def test_buttons_and_keys_choose_the_posture(visit):
@@ -174,6 +178,113 @@ def test_layers_are_switched(visit):
     assert covered(visit.until_drawn()) < covered(first)
     box.check()
     assert differ(first, visit.until_drawn()) < 0.005
+
+
+def test_the_chosen_grasp_is_replayed_and_said_to_be_simulated_or_planned(visit):
+    slider, said = visit.page.locator("#tick"), visit.page.locator("#caption")
+    slider.focus()
+    slider.press("End")
+    assert (
+        visit.state()["tick"] == "4" and "Grasp 1 of 2, simulated on the true object: the end." in said.text_content()
+    )
+    visit.page.locator("#grasps tbody tr").nth(1).click()
+    low = visit.until_drawn()
+    slider.focus()
+    slider.press("End")
+    assert visit.state()["grasp"] == "2" and visit.state()["tick"] == "110"
+    assert "Grasp 2 of 2, its planned motion: lift. Only grasp 1 was simulated." in said.text_content()
+    assert differ(low, visit.until_drawn()) > 0.02
+    slider.press("Home")
+    assert "its planned motion: approach" in said.text_content()
+
+
+def test_what_is_ticked_is_drawn_and_nothing_else(visit):
+    slider, seen = visit.page.locator("#tick"), set()
+    for _ in range(2):
+        boxes = visit.page.locator("#panel label:visible input[type=checkbox]:checked")
+        for name in boxes.evaluate_all("all => all.map((x) => x.parentElement.textContent)"):
+            if name == "contacts" and visit.state()["tick"]:
+                continue  # this film has no forces
+            box, first = visit.page.get_by_label(name, exact=True), visit.until_drawn()
+            box.click()
+            changed = (np.abs(first - visit.until_drawn()).max(-1) > 10).sum()
+            assert changed > 20 and not box.is_checked(), (name, changed)
+            seen.add(name)
+            box.click()
+        slider.focus()
+        slider.press("End")
+    assert seen == {"cloud", "surface", "hand", "contacts", "table", "axes", "camera", "true object"}
+    assert not visit.page.get_by_label("shell", exact=True).is_checked()
+    visit.page.get_by_label("shell", exact=True).check()
+    assert visit.state()["sigma"] == "2"
+    visit.page.get_by_label("shell", exact=True).uncheck()
+
+
+ROWS = np.arange(30.0).reshape(10, 3) * [0.01, 0.02, 0.005]
+"""Points whose box is 0.27 x 0.54 x 0.135 m."""
+
+
+def ply(kind, order=""):
+    head = f"ply\nformat {kind} 1.0\ncomment made\nelement vertex 10\nproperty uchar red\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "element face 0\n"
+    head = (head + "property list uchar int vertex_indices\nend_header\n").encode()
+    if kind == "ascii":
+        return head + "".join(f"7 {x} {y} {z}\n" for x, y, z in ROWS).encode()
+    rows = np.array([(7, tuple(row)) for row in ROWS], [("red", "u1"), ("point", f"{order}f4", 3)])
+    return head + rows.tobytes()
+
+
+def pcd(kind):
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS rgb x y z\nSIZE 4 8 8 8\nTYPE U F F F\nCOUNT 1 1 1 1\nWIDTH 10\nHEIGHT 1\n"
+    head = (head + f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 10\nDATA {kind}\n").encode()
+    if kind == "ascii":
+        return head + "".join(f"7 {x} {y} {z}\n" for x, y, z in ROWS).encode()
+    return head + np.array([(7, tuple(row)) for row in ROWS], [("rgb", "<u4"), ("point", "<f8", 3)]).tobytes()
+
+
+def test_clouds_of_all_formats_are_opened_and_wrong_ones_are_told(visit):
+    lines = [f"{x} {y} {z}" for x, y, z in ROWS]
+    files = {
+        "a.ply": ply("ascii"),
+        "b.ply": ply("binary_little_endian", "<"),
+        "c.ply": ply("binary_big_endian", ">"),
+        "d.pcd": pcd("ascii"),
+        "e.pcd": pcd("binary"),
+        "f.xyz": "\n".join(lines).encode(),
+        "g.pts": "\n".join(["10", *lines]).encode(),
+        "h.csv": ("x,y,z,r\n" + "\n".join(line.replace(" ", ",") + ",1" for line in lines)).encode(),
+    }
+    heard = visit.page.locator("#heard")
+    for name, data in files.items():
+        visit.page.evaluate("delete document.body.dataset.opened")
+        visit.page.set_input_files("#open", {"name": name, "mimeType": "", "buffer": data})
+        visit.wait("document.body.dataset.opened === '10'")
+        assert f"{name}: 10 points, 0.270 x 0.540 x 0.135 m." in heard.text_content()
+    assert visit.page.get_by_label("opened cloud", exact=True).is_checked()
+    for name, data, said in (
+        ("short.ply", files["b.ply"][:-9], "shorter than its header says"),
+        ("packed.pcd", pcd("binary_compressed"), "save it as ascii or binary"),
+        ("odd.png", b"\x89PNG\0\0", "neither .ply, .pcd nor text"),
+        ("empty.xyz", b"hello\n", "no line has three numbers"),
+    ):
+        visit.page.set_input_files("#open", {"name": name, "mimeType": "", "buffer": data})
+        visit.wait(f"document.getElementById('heard').textContent.startsWith('{name}')")
+        assert said in heard.text_content()
+
+
+def test_a_dropped_cloud_is_shown(visit):
+    visit.page.get_by_label("hand", exact=True).uncheck()
+    before = visit.until_drawn()
+    visit.page.evaluate(
+        """() => { const data = new DataTransfer();
+        const points = Array.from({ length: 2000 }, (_, k) => `${Math.cos(k)} ${Math.sin(k)} 0.2`);
+        data.items.add(new File([points.join("\\n")], "ring.xyz"));
+        window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true })); }"""
+    )
+    visit.wait("document.body.dataset.opened === '2000'")
+    assert "2.000 x 2.000 x 0.000 m" in visit.page.locator("#heard").text_content()
+    assert differ(before, visit.until_drawn()) > 0.005
+    visit.page.get_by_label("hand", exact=True).check()
 
 
 def test_the_replay_moves_by_its_slider_and_plays_to_the_end(visit):

@@ -22,6 +22,7 @@ from torchgrasp.app.report.viewer import (
     thin_mesh,
     three,
 )
+from torchgrasp.closure import ClosingTrace
 from torchgrasp.errors import Status
 from torchgrasp.hand.urdf import Shape
 from torchgrasp.ik.motion import APPROACH_DISTANCE
@@ -85,11 +86,45 @@ def test_the_replay_moves_the_true_object_as_the_closure_did(run):
     np.testing.assert_allclose(last - first, np.broadcast_to([0.0, 0.0, 0.1], first.shape), atol=1e-6)
 
 
+def test_the_film_says_which_grasp_it_is_and_names_its_moments(run):
+    replay = describe(run)["replay"]
+    assert replay["grasp"] == 1 and replay["story"].startswith("In the order of touch: index, middle, thumb.")
+    assert [tick for tick, _ in replay["moments"]] == sorted(tick for tick, _ in replay["moments"])
+    assert replay["moments"][-1] == (4, "the end")
+
+
+def test_forces_stand_at_the_contacts_in_the_frame_of_the_page(run):
+    """Turned by a right angle about z and lifted: what the hand feels along its x acts along the page's y."""
+    turned = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]], dtype=torch.float64)
+    trace = dataclasses.replace(
+        run.closure.trace,
+        points=torch.tensor([0.1, 0.0, 0.0]).double().expand(5, 3, 3),
+        forces=torch.tensor([2.0, 0.0, 1.0]).double().expand(5, 3, 3),
+    )
+    closure = dataclasses.replace(run.closure, hand_pose=turned.expand(5, 4, 4), trace=trace)
+    frame = np.array(describe(run)["frame"])
+    replay = describe(dataclasses.replace(run, closure=closure))["replay"]
+    point, force = frame @ [0.0, 0.1, 0.2, 1.0], frame[:3, :3] @ [0.0, 2.0, 1.0]
+    np.testing.assert_allclose(unpack(replay["touches"])[3, 1], point[:3], atol=1e-6)
+    np.testing.assert_allclose(unpack(replay["pushes"])[3, 1], force, atol=1e-6)
+
+
+def test_sensors_and_the_frame_of_the_file_are_where_the_cloud_says(run):
+    seen = describe(run)
+    frame = np.array(seen["frame"])
+    np.testing.assert_allclose(seen["sensors"], [frame[:3, :3] @ [0.5, 0.1, 0.3] + frame[:3, 3]], atol=1e-9)
+    points = run.cloud.points.numpy() @ frame[:3, :3].T + frame[:3, 3]
+    np.testing.assert_allclose(unpack(seen["cloud"]), points, atol=1e-6)
+    blind = dataclasses.replace(run, cloud=dataclasses.replace(run.cloud, viewpoint=None))
+    assert describe(blind)["sensors"] == []
+
+
 def test_a_long_run_is_thinned_to_what_a_page_holds(run):
     ticks = 1000
     rows = torch.arange(ticks) % len(run.closure.time)
     long = {name: getattr(run.closure, name)[rows] for name in ("forces", "object_pose", "hand_pose", "joints")}
-    closure = dataclasses.replace(run.closure, time=torch.arange(ticks).double(), **long)
+    trace = ClosingTrace(*(getattr(run.closure.trace, f.name)[rows] for f in dataclasses.fields(ClosingTrace)))
+    closure = dataclasses.replace(run.closure, time=torch.arange(ticks).double(), trace=trace, **long)
     many = run.grasps[torch.zeros(50, dtype=torch.int64)]
     fine = trimesh.creation.icosphere(subdivisions=6, radius=0.03)
     page = format_viewer(dataclasses.replace(run, closure=closure, grasps=many, mesh=fine))

@@ -261,18 +261,23 @@ def print_grasps(run: Run) -> bool:
 class View(Command):
     """Open the 3D page of a folder that `torchgrasp grasp` wrote, view.html, in the browser."""
 
-    folder: Path = positional("folder that `torchgrasp grasp` wrote")
+    folder: Path = positional(
+        "folder that `torchgrasp grasp` wrote, a 3D page, or the name of a folder in out/, as jug"
+    )
     no_browser: bool = option(False, "only print the address")
 
     def run(self) -> int:
         """Print the address of the 3D page and open it in the browser; return the exit code."""
-        page = (self.folder if self.folder.is_dir() else self.folder.parent) / VIEW
+        folder = self.folder if self.folder.exists() else "out" / self.folder
+        page = folder if folder.suffix == ".html" else (folder if folder.is_dir() else folder.parent) / VIEW
         if not page.is_file():
-            wanted = "a folder that `torchgrasp grasp` wrote with a report"
+            wanted = (
+                f"a folder that `torchgrasp grasp` wrote with a report: `torchgrasp grasp CLOUD --out {self.folder}`"
+            )
             raise BadArgument("FOLDER", f"{self.folder} without {VIEW}", wanted)
         print(page.resolve().as_uri())
-        if not self.no_browser:
-            webbrowser.open(page.resolve().as_uri())
+        if not self.no_browser and not webbrowser.open(page.resolve().as_uri()):
+            print("No browser was found here: open this address on another machine, or copy the file, which is whole.")
         return 0
 
 

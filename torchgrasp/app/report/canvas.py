@@ -1,6 +1,7 @@
 """Common colours of all pictures, and a canvas that renders its triangles to pixels in NumPy, without OpenGL."""
 
 import io
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,8 +14,8 @@ Color = tuple[float, float, float]
 Direction = tuple[float, float, float]
 FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")  # colours of the fingers, in grasp order
 AXES = ("#d62728", "#2ca02c", "#1f4fd8")  # colours of x, y and z of a frame
-HAND, OBJECT, TABLE = "#a9b0ba", "#e9d7b3", "#eceae4"
-"""Colours of the palm with parked fingers, of the object, and of the table."""
+HAND, OBJECT, TABLE, SHADOW = "#a9b0ba", "#e9d7b3", "#eceae4", "#c9c6bd"
+"""Colours of the palm with parked fingers, of the object, of the table, and of shadows on the table."""
 OBJECTS = ("#e8743b", "#3f83d9", "#57a84f", "#b65fae", "#e0b92f", "#35aaa3", "#dd6b78", "#8474c9")
 """Colours of the objects of a scene in the order of their labels; after the last colour the first follows."""
 PAPER, INK, GRID, ALARM = "#fcfcfa", "#22262b", "#dcdad3", "#c2452d"
@@ -80,14 +81,22 @@ class Canvas:
             for part in (trimesh.creation.icosphere(subdivisions=1, radius=0.13), shaft, head):
                 self.add_mesh(length * part.vertices @ turn.T + start, part.faces, color)
 
-    def add_table(self, corners: Points, height: float | None) -> None:
-        """Add an unshaded round table top at `height` [m], centred on `corners` in x and y. None adds nothing."""
+    def add_table(
+        self, corners: Points, height: float | None, shadows: Sequence[tuple[np.ndarray, np.ndarray]] = ()
+    ) -> None:
+        """Add an unshaded round table top at `height` [m], centred on `corners` in x and y. None adds nothing.
+
+        The `shadows` are meshes, by vertices and faces, whose outlines darken the table straight below them.
+        """
         if height is None:
             return
         radius = 0.55 * float(np.linalg.norm(np.ptp(corners[:, :2], axis=0))) + 0.02
         top = trimesh.creation.cylinder(radius, 1e-4, sections=120)
         center = np.append((corners[:, :2].min(0) + corners[:, :2].max(0)) / 2, height - 1e-3)
         self.add_mesh(top.vertices + center, top.faces, TABLE, lit=False)
+        for vertices, faces in shadows:
+            flat = np.column_stack([vertices[:, :2], np.full(len(vertices), height - 5e-4)])
+            self.add_mesh(flat, faces, SHADOW, np.tile([0.0, 0.0, 1.0], (len(flat), 1)), lit=False)
 
     def render(self, camera: Camera, size: tuple[int, int] = SIZE) -> UInt8[np.ndarray, "h w 3"]:
         """Return the picture that a camera sees, as pixels."""

@@ -18,7 +18,7 @@ from torchgrasp.lazy import trimesh
 
 WIDTH, STILL, TITLE = 1680, 340, 44
 """Width of the strip, height of its stills with titles, and height of a title [pixels]."""
-LETTERS = "abcdef"  # names of the moments in stills and plots
+LETTERS = "abcdefgh"  # names of the moments in stills and plots
 
 
 def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction) -> bytes:
@@ -36,7 +36,7 @@ def draw_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direc
         axis.imshow(still, aspect="auto")
         axis.set_axis_off()
         title = f"{LETTERS[k]}  {float(closure.time[moment.tick]):.2f} s  {moment.name}"
-        axis.set_title(title, loc="left", x=0.04, color=moment.color, fontsize=14)
+        axis.set_title(title, loc="left", x=0.04, color=moment.color, fontsize=14 if count < 6 else 12)
 
     figure.subplots_adjust(0.05, 60 / height, 0.985, 1 - (STILL + 62) / height, hspace=50 / float(np.mean(heights)))
     axes = figure.subplots(len(plots), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
@@ -66,7 +66,7 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
     on_its_way = f" On its way the hand touched something {times(stops)}." if stops else ""
     again = f" The hand closed {times(attempts)}." if attempts > 1 else ""
     end = (lost or "The object was held.") + on_its_way + again
-    return f"In the order of touch: {order}. {end} Each picture is taken from the hand."
+    return f"In the order of touch: {order}. {end}"
 
 
 def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:
@@ -81,20 +81,18 @@ def _draw_stills(
     at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
     vertices, faces = torch.tensor(np.array(mesh.vertices), dtype=torch.float64), np.asarray(mesh.faces)
     places = to_array(apply(closure.object_pose[at].double(), vertices))
-    names, base = closure.joint_names, to_array(closure.hand_pose[at, :3, 3])
-    hands = [solids_from_hand(hand, closure.joints[t], names, closure.hand_pose[t]) for t in at]
-    # The table is fixed, so it sinks in the pictures while the hand rises.
+    hands = [solids_from_hand(hand, closure.joints[t], closure.joint_names, closure.hand_pose[t]) for t in at]
     table = float(apply(closure.object_pose[0].double(), vertices)[:, 2].min())
-    inside = [place - b for place, b in zip(places, base, strict=True)]
-    near = [x for x in inside if np.abs(x.mean(0) - inside[0].mean(0)).max() < 0.25]  # a lost object is not framed
-    seen = np.concatenate([*near, *(s.vertices - b for solids, b in zip(hands, base, strict=True) for s in solids)])
-    pictures, size = [], (WIDTH // len(ticks), STILL - TITLE)
-    for place, solids, b in zip(places, hands, base, strict=True):
+    near = [x for x in places if np.abs(x - places[0]).mean(0).max() < 0.25]  # a lost object is not framed
+    seen = np.concatenate([*near, *(s.vertices for solids in hands for s in solids)])
+    size = WIDTH // len(ticks), STILL - TITLE
+    camera, pictures = paint.frame_camera(seen, direction, size=size), []  # it stands still: the lift is seen
+    for place, solids in zip(places, hands, strict=True):
         canvas = paint.Canvas()
+        canvas.add_table(seen, table, [(place, faces), *((s.vertices, s.faces) for s in solids)])
         canvas.add_mesh(place, faces, paint.OBJECT)
         add_solids(canvas, solids)
-        canvas.add_table(seen + b, table)
-        pictures.append(canvas.render(paint.frame_camera(seen + b, direction, size=size), size))
+        pictures.append(canvas.render(camera, size))
     return pictures
 
 

@@ -226,6 +226,10 @@ def moments_of(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tupl
     found = [Moment(tick_of(closure, 0), "open hand")]
     if closure.contact_order:
         found.append(Moment(first_touches(closure)[0], f"{fingers[closure.contact_order[0]]} touches first"))
+    acts = torch.cat([torch.zeros(1, dtype=torch.bool), closure.trace.blend.isfinite().any(1)])
+    begins = torch.nonzero(acts[1:] & ~acts[:-1])[:, 0]  # of the closings
+    if closure.attempts == len(begins) > 1:
+        found.append(Moment(int(begins[-1]), f"closing {len(begins)} begins"))
     all_touch = len(closure.contact_order) == len(fingers)
     ends = ((1, "all touch" if all_touch else "the closing ends"), (2, "pressed"))
     found += [Moment(tick_of(closure, k), name) for k, name in ends if bool(closure.phases[k].isfinite())]

@@ -16,14 +16,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, map_colors
+from torchgrasp.app.report.film import describe_film
 from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, render
-from torchgrasp.app.report.run import Run, verdict
+from torchgrasp.app.report.run import Run, moments_of, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
 from torchgrasp.app.report.stills import facing, to_array, view_of
 from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
 from torchgrasp.control.forces import squeeze
 from torchgrasp.files import write_file
+from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.plane import upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
 from torchgrasp.values import Grasps
@@ -40,9 +43,9 @@ def write_viewer(path: Path | str, run: Run) -> Path:
     """Write a run as a 3D page in one HTML file, atomically. The page needs WebGL, but no network.
 
     The page shows the cloud, the surface by its standard deviation, a shell at k standard deviations, contacts, four
-    postures of the hand for each of the best 20 grasps, and the closing with its forces. The address may name a state,
-    as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`. Returns the path. Raises `OutputError` if
-    the file cannot be written.
+    postures of the hand for each of the best 20 grasps, and their motion with the lift. The closing, with its forces,
+    is the film of the first grasp. The address may name a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or
+    `view.html#tick=50`. Returns the path. Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
@@ -60,8 +63,8 @@ def write_viewer(path: Path | str, run: Run) -> Path:
 def format_viewer(run: Run) -> str:
     """Return the 3D page of a run as HTML."""
     contents, folder = describe(run), Path(__file__).with_name("templates")
-    # The two files are one function, so that no name of theirs meets a name of the library.
-    parts = "".join((folder / name).read_text(encoding="utf-8") for name in ("scene.js", "panel.js"))
+    # The files are one function, so that no name of theirs meets a name of the library.
+    parts = "".join((folder / name).read_text(encoding="utf-8") for name in ("scene.js", "cloud.js", "panel.js"))
     # "<" would end the block of data early; within JSON it is only in texts.
     data = json.dumps(contents, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     scripts = (three(), f'(() => {{\n"use strict";\n{parts}}})();\n')
@@ -85,6 +88,7 @@ def three() -> str:
 
 def describe(run: Run) -> dict[str, Any]:
     """Return the contents of the 3D page as a dictionary for JSON, in an upright frame."""
+    frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
     sentence, run = verdict(run), run.upright()
     best, scene = run.executable[:MOST_GRASPS], run.scene
     x, y, z = facing(best[0]) if len(best) else view_of(run.cloud)
@@ -95,6 +99,8 @@ def describe(run: Run) -> dict[str, Any]:
         "verdict": sentence,
         "good": bool(run.closure.held if run.closure is not None else len(best) > 0),
         "eye": (eye / np.linalg.norm(eye)).tolist(),
+        "frame": frame.tolist(),
+        "sensors": [v.viewpoint.tolist() for v in run.cloud.split_views() if v.viewpoint is not None],
         "table": None if run.spec.table is None else TABLE,
         "object": OBJECT,
         "fingers": [list(pair) for pair in zip(run.hand.tips.names, FINGERS, strict=False)],
@@ -160,10 +166,18 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
 def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
     """Return the data of the replayed closing: mesh, poses of object and links at some ticks, forces at all ticks."""
     assert run.mesh is not None
+    centre, names = torch.tensor(np.array(run.mesh.center_mass), dtype=torch.float64), run.hand.tips.names
     ticks = thin_rows(len(closure.time), MOST_TICKS)
     kept, faces = thin_mesh(np.asarray(run.mesh.vertices), np.asarray(run.mesh.faces), MOST_FACES)
     links = link_poses(run.hand, closure.joints[ticks], closure.joint_names, closure.hand_pose[ticks])
+    hand_pose, trace = closure.hand_pose[ticks].double(), closure.trace
+    moments = [(int(np.abs(ticks - m.tick).argmin()), m.name) for m in moments_of(closure, centre, names)]
     return {
+        "grasp": 1,  # the first is the one that was closed
+        "story": describe_film(run.mesh, run.hand, closure),
+        "moments": moments,
+        "touches": pack(to_array(apply(hand_pose, trace.points[ticks].double()))),
+        "pushes": pack(to_array(trace.forces[ticks].double() @ hand_pose[:, :3, :3].mT)),
         "points": pack(np.asarray(run.mesh.vertices)[kept]),
         "faces": pack(faces, "u4"),
         "ticks": pack(ticks, "u4"),
