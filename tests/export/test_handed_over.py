@@ -102,11 +102,12 @@ def test_moveit_gets_postures_pose_approach_and_quality(name):
     place, q = message["grasp_pose"]["pose"]["position"], message["grasp_pose"]["pose"]["orientation"]
     found = pose([place[k] for k in "xyz"], [q[k] for k in "wxyz"])
     np.testing.assert_allclose(found, grasp.obj_from_hand[0], atol=1e-8)
-    vectors = [message[key]["direction"]["vector"] for key in ("pre_grasp_approach", "post_grasp_retreat")]
-    there, back = (np.array([v[k] for k in "xyz"]) for v in vectors)
+    vectors = [message[key]["direction"]["vector"] for key in ("pre_grasp_approach", "post_grasp_retreat", "post_place_retreat")]
+    there, back, leave = (np.array([v[k] for k in "xyz"]) for v in vectors)
     np.testing.assert_allclose(there, grasp.approach[0], atol=1e-8)
+    np.testing.assert_array_equal(leave, -there)  # without the object
     np.testing.assert_array_equal(back, [0, 0, 1])  # up, off the table of the pinch
-    for key in ("pre_grasp_approach", "post_grasp_retreat"):
+    for key in ("pre_grasp_approach", "post_grasp_retreat", "post_place_retreat"):
         assert message[key]["min_distance"] < message[key]["desired_distance"] == 0.1
     assert message["grasp_pose"]["header"] == {"frame_id": "object"} and message["allowed_touch_objects"] == ["object"]
 

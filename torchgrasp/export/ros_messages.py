@@ -79,6 +79,7 @@ def format_moveit(
             "grasp_quality": float(grasps.success[row]),
             "pre_grasp_approach": _translation(grasps.approach[row]),
             "post_grasp_retreat": _translation(up),
+            "post_place_retreat": _translation(-grasps.approach[row]),
             "max_contact_force": force,
             "allowed_touch_objects": [object_id],
         }
