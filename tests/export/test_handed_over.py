@@ -102,7 +102,10 @@ def test_moveit_gets_postures_pose_approach_and_quality(name):
     place, q = message["grasp_pose"]["pose"]["position"], message["grasp_pose"]["pose"]["orientation"]
     found = pose([place[k] for k in "xyz"], [q[k] for k in "wxyz"])
     np.testing.assert_allclose(found, grasp.obj_from_hand[0], atol=1e-8)
-    vectors = [message[key]["direction"]["vector"] for key in ("pre_grasp_approach", "post_grasp_retreat", "post_place_retreat")]
+    vectors = [
+        message[key]["direction"]["vector"]
+        for key in ("pre_grasp_approach", "post_grasp_retreat", "post_place_retreat")
+    ]
     there, back, leave = (np.array([v[k] for k in "xyz"]) for v in vectors)
     np.testing.assert_allclose(there, grasp.approach[0], atol=1e-8)
     np.testing.assert_array_equal(leave, -there)  # without the object
