@@ -107,6 +107,7 @@ class ClosureResult(Value):
         object_pose: pose of the object in the frame of the grasp.
         hand_pose: pose of the hand in the frame of the grasp.
         joints: positions [rad] of every joint of the URDF, in the order of `joint_names`.
+        targets: positions [rad] to which the drives of these joints were sent in the tick that ended.
         joint_names: names of the joints.
         contact_order: the fingers in the order of their first contacts.
         object_motion: motion of the object in the hand from the pre-grasp to the end.
@@ -131,6 +132,7 @@ class ClosureResult(Value):
     object_pose: Annotated[Float[Tensor, "t 4 4"], ANY]
     hand_pose: Annotated[Float[Tensor, "t 4 4"], ANY]
     joints: Annotated[Float[Tensor, "t j"], ANY]
+    targets: Annotated[Float[Tensor, "t j"], ANY]
     joint_names: tuple[str, ...]
     contact_order: tuple[int, ...]
     object_motion: ObjectMotion

@@ -49,9 +49,9 @@ def record(moved=None, turned=None, rises=True, status=Status.DROPPED, order=(0,
     return ClosureResult(
         held=status is Status.OK, status=status, time=TIME, forces=nothing + real([1.0, 2.0, 3.0]),
         object_pose=rigid(rotation, shift + CENTRE - rotation @ CENTRE),
-        hand_pose=rigid(torch.eye(3).double().expand(TICKS, 3, 3), RISE), joints=nothing[:, :0], joint_names=(),
-        contact_order=order, object_motion=still, pushed=still, before_lift=still, rise=0.0, unbalanced=0.0, slip=still,
-        start_overlap=0.004, disturbance=stray,
+        hand_pose=rigid(torch.eye(3).double().expand(TICKS, 3, 3), RISE), joints=nothing[:, :0], targets=nothing[:, :0],
+        joint_names=(), contact_order=order, object_motion=still, pushed=still, before_lift=still, rise=0.0,
+        unbalanced=0.0, slip=still, start_overlap=0.004, disturbance=stray,
         trace=ClosingTrace(vectors, vectors, vectors, nothing, nothing, *nothing.T[:2]),
         phases=changes.pop("phases", real([0.5, 1.0, 1.5])), stops=0, attempts=1, seconds=0.0,
     )  # fmt: skip

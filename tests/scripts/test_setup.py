@@ -98,7 +98,7 @@ def test_setup_chooses_a_build_of_torch(set_up, tmp_path, needs, around, own_ind
     done, installs = set_up(configured=report(wheel, *needs), index=index, **around)
     assert done.returncode == 0 and told in done.stdout and ("GB" in done.stdout) is ("GB" in told), done.stderr
     assert (f"--index-url {INDEX}" in installs[0]) is own_index and "torch==" in installs[0]
-    assert "--index-url" not in installs[1] and "-e .[sim,mujoco,cluster,dev,docs]" in installs[1]
+    assert "--index-url" not in installs[1] and "-e .[sim,mujoco,cluster,data,dev,docs]" in installs[1]
     done, installs = set_up()  # a second run does nothing
     assert done.returncode == 0 and installs == [] and done.stdout == ""
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from torchgrasp.data.reader import CARD, GraspShards, read_shards, shard_path
 from torchgrasp.data.shards import JobRow, Shard, join_shards, load_shard, pack_shard
+from torchgrasp.data.tables import render_card
 from torchgrasp.errors import ModelFileError, Status
 from torchgrasp.files import begin_folder, format_json, hold_folder, remove_file, sha256, write_file
 
@@ -21,25 +22,6 @@ FAILED = (Status.WORKER_DIED, Status.TIMED_OUT, Status.BROKEN)
 """Statuses of a failed job that say nothing about its object: the next call tries the job again."""
 Work = Callable[[Sequence[int]], Generator[tuple[int, bytes | Status], None, None]]
 """Function of job indices that yields, as each job ends, a position in these indices, and a file or a failure."""
-FIELDS = (
-    ("points", "p x 3", "cloud of each job, one behind the other [m]"),
-    ("viewpoints", "j x 3", "position of the camera [m]; zeros: unknown"),
-    ("grasps.joints, grasps.pregrasp", "g x h", "actuated joints, closed and opened [rad]"),
-    ("grasps.obj_from_hand", "g x 4 x 4", "pose of the hand's base link in the object's frame [m]"),
-    ("grasps.approach", "g x 3", "direction of the straight path to the pre-grasp"),
-    ("grasps.contacts.points, .normals", "g x f x 3", "planned contacts and outward normals"),
-    ("grasps.contacts.std_m", "g x f", "standard deviation of the surface at the contact [m]"),
-    ("grasps.contacts.variance", "g x f", "the same in the normalised units of the shape"),
-    ("grasps.certificate.margin, .closed", "g", "how far from losing form closure, and whether it has it"),
-    ("grasps.certificate.witness", "g x 6", "the wrench that is hardest to resist"),
-    ("grasps.certificate.rank_ratio, .residual", "g", "how well the certificate itself is conditioned"),
-    ("grasps.clearance, .tip_error, .normal_angle", "g, g x f, g x f", "distances [m] and angles [rad] of the plan"),
-    ("grasps.permutation", "g x f", "contact of each finger in the plan"),
-    ("grasps.score", "g", "log-odds of the predicted success"),
-    ("grasps.status", "g", "0: executable; all are"),
-    ("passed, outcome", "g x d", "verdict of each try in the simulator, and its Status"),
-)
-"""The tensors in a shard file: name, shape and meaning of each."""
 
 
 class Campaign(NamedTuple):
@@ -122,7 +104,7 @@ class _Store:
         """Write the README, then `card.json`, which marks a complete data set; remove the folder of single jobs."""
         rows = [self.rows[j] for j in range(len(self.campaign.rows))]
         card = card_of(self.campaign, rows, [self.digests[k] for k in self.shards])
-        write_file(self.folder / README, describe(card))
+        write_file(self.folder / README, render_card("shards.md", card=card))
         write_file(self.folder / CARD, format_json(card) + "\n")
         with contextlib.suppress(OSError):  # it may hold what is not ours
             (self.folder / PARTS).rmdir()
@@ -186,59 +168,3 @@ def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> d
         "jobs_in_shard": asked["jobs_in_shard"], "asked": asked, "counts": counts, "shards_sha256": digests,
         "jobs": jobs,
     }  # fmt: skip
-
-
-def describe(card: dict[str, Any]) -> str:
-    """Return the content of `card.json` as a README in Markdown, with the header that data set hubs read."""
-    asked, counts = card["asked"], card["counts"]
-    hand, protocol, trials = asked["hand"], asked["protocol"], asked["trials"]
-    reasons = "\n".join(f"| {name.lower()} | {n} | {Status[name].sentence} |" for name, n in counts["status"].items())
-    fields = "\n".join(f"| {name} | {shape} | {meaning} |" for name, shape, meaning in FIELDS)
-    versions = ", ".join(f"{name} {version}" for name, version in asked["versions"].items() if version != "none")
-    share = f"{counts['passed']} of {counts['tries']} tries passed" if counts["tries"] else "nothing was tried"
-    tags = "tags: [robotics, dexterous-grasping]"
-    return f"""---
-license: {_quoted(card["licence"])}
-{tags}
----
-# Grasps of the {hand["name"]} hand, tried under "{protocol["name"]}"
-
-Grasps that torchgrasp planned on partial point clouds, each with its certificate of frictional form closure, the
-standard deviation of the surface at its contacts, its predicted success, and its success in simulation.
-
-* {counts["jobs"]} jobs, one for each view of {counts["objects"]} objects of {counts["families"]} families
-* {counts["grasps"]} grasps; {share}
-* licence: {card["licence"]}
-* hand: {hand["name"]}, fingers {hand["finger_names"]}, SHA-256 {hand["sha256"]}
-* grasps of a view: {trials["grasps"]} at most ({trials["ranks"]}), of {trials["starts"]} starts, seed {trials["seed"]}
-* simulator: {protocol["trial"]["simulator"]}, friction {protocol["trial"]["friction"]:g}
-* planned on {asked["device"]}, made with {versions}
-
-| status of a job | jobs | meaning |
-| --- | --- | --- |
-{reasons}
-
-## Reading
-
-```python
-from torchgrasp.data import read_shards
-
-data = read_shards(".", points=512)  # for a torch DataLoader: each item is a dict of one grasp
-first = data.job(0)  # or job by job: row, cloud, grasps, passed, outcome
-```
-
-`card.json` has a row for each job, and all that was asked. `shard-NNNNNN.safetensors` holds {card["jobs_in_shard"]}
-jobs, one behind the other; its metadata says how many points and grasps are each job's. Lengths are metres, angles
-radians, in the frame of the object.
-
-| tensor | shape | meaning |
-| --- | --- | --- |
-{fields}
-
-p points, j jobs, g grasps, d tries of a grasp, h joints ({hand["joint_names"]}), f fingers.
-"""
-
-
-def _quoted(text: str) -> str:
-    """Return a text as a YAML value for the header of the README."""
-    return text.lower() if text.replace("-", "").replace(".", "").isalnum() else '"' + text.replace('"', "'") + '"'

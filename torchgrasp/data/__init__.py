@@ -5,8 +5,11 @@ from torchgrasp.data.manifest import ObjectEntry as ObjectEntry, read_entries as
 from torchgrasp.data.manifest import list_views, read_object_mesh, read_view, write_objects
 from torchgrasp.data.shards import JobRow
 from torchgrasp.data.reader import GraspShards, ShardJob, read_shards
+from torchgrasp.data.parquet import write_parquet
+from torchgrasp.data.lerobot import write_lerobot
 
 __all__ = [
     "GraspObject", "GraspShards", "JobRow", "ShardJob", "list_objects", "list_views", "load_object", "load_scene",
-    "load_shipped_grasp", "read_object_mesh", "read_shards", "read_view", "write_objects",
+    "load_shipped_grasp", "read_object_mesh", "read_shards", "read_view", "write_lerobot", "write_objects",
+    "write_parquet",
 ]  # fmt: skip

@@ -31,6 +31,7 @@ class Tick(Value):
     hand_pose: Float[Tensor, "*t 4 4"]
     neighbour_pose: Float[Tensor, "*t m 4 4"]
     joints: Float[Tensor, "*t j"]
+    targets: Float[Tensor, "*t j"]
     touching: Int[Tensor, "*t"]
     centre: Float[Tensor, "*t 3"]
     felt: Float[Tensor, "*t 2"]

@@ -190,7 +190,7 @@ class _Lift:
         pose, joints = scene.object_pose(), scene.joints()
         arrays = (
             np.float64(robot.steps * self.spec.timestep), pose, scene.hand_pose(), scene.neighbour_poses(),
-            joints, robot.finger.sum(), pose[:3, :3] @ scene.centre + pose[:3, 3], np.array(self.run.felt),
+            joints, robot.sent, robot.finger.sum(), pose[:3, :3] @ scene.centre + pose[:3, 3], np.array(self.run.felt),
         )  # fmt: skip
         tick = Tick(*map(torch.as_tensor, arrays), blend=self.run.controller.blend, truth=robot.truth)
         self.ticks.append(tick)
@@ -242,7 +242,7 @@ class _Lift:
         return ClosureResult(
             held=status is Status.OK, status=status, time=ticks.time, forces=truth.normal_force,
             object_pose=ticks.object_pose, hand_pose=ticks.hand_pose, joints=ticks.joints,
-            joint_names=self.run.scene.joint_names,
+            targets=ticks.targets, joint_names=self.run.scene.joint_names,
             contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
             object_motion=self._motion(self.arrived, -1),
             pushed=self._motion(self.arrived, self.touched, in_hand=False),

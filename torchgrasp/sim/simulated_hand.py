@@ -42,11 +42,12 @@ class SimulatedHand:
 
     `truth` holds the contacts of the last tick. `force` (f,) are the true normal forces [N], averaged over the tick,
     `pushes` (f, 3) the full forces. `finger` (f,) tells which fingers touched the object in the last step. `steps`
-    counts steps of the simulator. `first_touch` is the step of each fingertip's first contact, infinite before it.
-    Three attributes are about the hand's other contacts, with entries for neighbours, table top and target, in this
-    order: `first_stray` is the step of the first contact, `stray` the sum of the impulses [N s], `most_stray` the
-    largest force [N] over a tick. The scene is at its initial state. `control_rate` [Hz] is the rate of ticks. The
-    generator draws the noise of the fingertips; without one there is no noise.
+    counts steps of the simulator. `sent` (j,) are the targets of the last tick [rad], in the scene's order of joints.
+    `first_touch` is the step of each fingertip's first contact, infinite before it. Three attributes are about the
+    hand's other contacts, with entries for neighbours, table top and target, in this order: `first_stray` is the step
+    of the first contact, `stray` the sum of the impulses [N s], `most_stray` the largest force [N] over a tick. The
+    scene is at its initial state. `control_rate` [Hz] is the rate of ticks. The generator draws the noise of the
+    fingertips; without one there is no noise.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class SimulatedHand:
         zero = torch.zeros(fingers, dtype=torch.float64)
         self.truth = TipContact(zero, torch.zeros_like(nothing), nothing, nothing, sliding=zero)
         self._poses: np.ndarray | None = None
+        self.sent = scene.joints()
         names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
         self._centres = torch.cat([centres, torch.ones(fingers, 1, dtype=torch.float64)], dim=-1).numpy()
         self._to_scene = np.array([names.index(name) for name in scene.joint_names])
@@ -76,7 +78,8 @@ class SimulatedHand:
         """Drive joints and palm towards their targets for one control period; return the observation at its end."""
         if len(targets.joints) != len(self._to_scene):
             raise BadArgument("targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF")
-        self.scene.drive(targets.joints.numpy()[self._to_scene])
+        self.sent = targets.joints.numpy()[self._to_scene]
+        self.scene.drive(self.sent)
         palm = targets.palm.numpy()
         last = palm if self._palm is None else self._palm  # the scene begins where the palm is first sent
         if palm.any() or last.any():

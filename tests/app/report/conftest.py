@@ -55,6 +55,7 @@ def run() -> Run:
         object_pose=lifted,
         hand_pose=held,
         joints=hand.expand_joints(joints[:1]).expand(steps, -1).clone(),
+        targets=hand.expand_joints(joints[:1]).expand(steps, -1).clone(),
         joint_names=hand.tree.joint_names,
         contact_order=(0, 1, 2),
         object_motion=ObjectMotion(0.003, math.radians(2)),

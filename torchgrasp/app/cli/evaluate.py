@@ -12,7 +12,7 @@ from torchgrasp.app.report.evaluation import SHARE_NAMES, list_causes, list_figu
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
 from torchgrasp.checks import Count, Range, Seed
-from torchgrasp.data import JobRow, read_entries
+from torchgrasp.data import JobRow, read_entries, write_parquet
 from torchgrasp.errors import BadArgument, DatasetError, Status
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
@@ -170,6 +170,7 @@ class Campaign(_Trials):
     objects: Path = positional(OBJECTS_HELP)
     protocol: Protocol = option("tabletop", PROTOCOL_HELP)
     licence: str = option("unknown", "licence of the data set, for its card, as CC-BY-4.0")
+    parquet: Path | None = option(None, "folder for the same data as Parquet, for `datasets.load_dataset`")
     jobs_in_shard: int = option(64, "number of jobs whose records share a file")
     workers: Annotated[int, Range(0, 1024)] = option(
         1, "processes here, 0: this one; the data do not depend on their number"
@@ -199,6 +200,9 @@ class Campaign(_Trials):
                 bar.update()
 
             data = run_campaign(self.objects, hand, self.out, spec, source, show)
+        if self.parquet is not None:
+            with naming(folder="--parquet", path="--parquet", data="OBJECTS"):
+                write_parquet(data, self.parquet)
         counts = data.card["counts"]
         print(f"{counts['jobs']} jobs: {', '.join(f'{n} {name.lower()}' for name, n in counts['status'].items())}")
         print(f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {self.out}")

@@ -1,0 +1,106 @@
+"""A data set as Parquet: other libraries read offline what our own reader reads."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.campaign.cheap import campaign, contents, work_on
+from tests.data.others import read_foreign
+from torchgrasp.campaign.folder import carry_out
+from torchgrasp.data import GraspShards, read_shards, write_parquet
+from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
+
+parquet = pytest.importorskip("pyarrow.parquet")
+JOBS = 21
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> GraspShards:
+    """Three shards; the first has jobs without grasps, and one without a cloud."""
+    folder = tmp_path_factory.mktemp("shards")
+    asked = campaign(JOBS)
+    carry_out(asked, folder, work_on(asked, 0))
+    return read_shards(folder)
+
+
+@pytest.fixture(scope="module")
+def written(shards: GraspShards, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_parquet(shards, tmp_path_factory.mktemp("parquet") / "data")
+
+
+def rows(folder: Path, name: str) -> dict[str, list[Any]]:
+    return parquet.read_table(folder / name).to_pydict()
+
+
+def check_rows(shards: GraspShards, found: dict[str, list[Any]]) -> None:
+    """Compare rows of grasps with the items of the reader, number by number."""
+    assert found["grasp"] == list(range(len(shards)))
+    for i, item in enumerate(shards):
+        row = shards.jobs[int(item["job"])]
+        assert [found[name][i] for name in ("object", "view", "family", "group")] == [*row[:2], row.family, row.group]
+        for name in set(item) - {"points", "viewpoint"}:
+            np.testing.assert_array_equal(np.array(found[name][i], item[name].numpy().dtype), item[name].numpy())
+    tried = [[Status(x).name for x in grasp] for j in range(JOBS) for grasp in shards.job(j).outcome.tolist()]
+    assert found["outcomes"] == tried and set(found["friction"]) == {0.5} and set(found["seed"]) == {0}
+
+
+def check_views(shards: GraspShards, found: dict[str, list[Any]]) -> None:
+    """Compare rows of views with the jobs of the reader."""
+    assert found["job"] == list(range(JOBS)) and found["status"][2] == "BAD_OBJECT" and found["note"][2] == "no mesh"
+    for j in range(JOBS):
+        row, cloud, *_ = shards.job(j)
+        assert [found[x][j] for x in ("object", "grasps", "passed")] == [row.object, row.grasps, row.passed]
+        if cloud is None:
+            assert found["points"][j] == [] and found["viewpoint"][j] is None
+        else:
+            np.testing.assert_array_equal(np.float32(found["points"][j]), cloud.points.float().numpy())
+            np.testing.assert_array_equal(np.float32(found["viewpoint"][j]), cloud.viewpoint.float().numpy())
+
+
+def test_arrow_reads_what_the_reader_reads(shards: GraspShards, written: Path):
+    check_rows(shards, rows(written, "grasps"))
+    check_views(shards, rows(written, "views"))
+    meta = parquet.read_schema(written / "grasps" / "shard-000001.parquet").metadata
+    assert json.loads(meta[b"torchgrasp"])["joint_names"] == "a, b, c, d"
+
+
+def test_hugging_face_and_croissant_read_it_offline(shards: GraspShards, written: Path, tmp_path: Path):
+    found = read_foreign("tables", written, tmp_path)
+    check_rows(shards, found["grasps.rows"])
+    check_views(shards, found["views.rows"])
+    types = found["grasps.types"]
+    assert types["joints"] == "List(Value('float32'), length=4)" and types["closed"] == "Value('bool')"
+    assert types["contacts"] == "List(List(Value('float32'), length=3), length=3)"
+    assert found["errors"] == [] and found["name"].startswith("grasps-toy-")
+    check_rows(shards, found["grasps.records"])
+    check_views(shards, found["views.records"])
+
+
+def test_an_export_that_was_broken_off_goes_on_and_others_are_refused(
+    shards: GraspShards, written: Path, tmp_path: Path
+):
+    again = tmp_path / "again"
+    write_parquet(shards, again)
+    for name in ("README.md", "croissant.json", "grasps/shard-000002.parquet"):
+        (again / name).unlink()
+    write_parquet(shards, again)
+    assert contents(again) == contents(written)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    with pytest.raises(OutputError, match="other files"):
+        write_parquet(shards, tmp_path / "mine")
+
+
+def test_no_grasps_and_no_pyarrow_are_told(tmp_path: Path, shards: GraspShards, monkeypatch: pytest.MonkeyPatch):
+    asked = campaign(1)
+    carry_out(asked, tmp_path / "none", work_on(asked, 0))
+    with pytest.raises(BadArgument, match="without a grasp"):
+        write_parquet(read_shards(tmp_path / "none"), tmp_path / "out")
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    with pytest.raises(MissingExtra, match=r"torchgrasp\[data\]"):
+        write_parquet(shards, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

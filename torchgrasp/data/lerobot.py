@@ -1,0 +1,129 @@
+"""Simulated closings as episodes of a LeRobot data set (v3.0), to train policies on."""
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.checks import checked
+from torchgrasp.closure import ClosureResult
+from torchgrasp.data.tables import as_table, import_arrow, pack_table, render_card, write_folder
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.hand import Hand
+from torchgrasp.lazy import spatial
+
+Episodes = Sequence[tuple[str, ClosureResult]]
+
+
+@checked
+def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
+    """Write closings, each with its task in words, as a LeRobot data set (v3.0); return the folder.
+
+    `LeRobotDataset(name, root=folder)` reads it. A frame is a control tick; poses [m] are in the frame of the grasp:
+
+    | feature | contents |
+    | --- | --- |
+    | `observation.state` | joints [rad] of the URDF by name, then position and quaternion (x, y, z, w) of the hand |
+    | `observation.forces` | force of each fingertip on the object [N], in the hand's frame |
+    | `observation.environment_state` | position and quaternion of the object |
+    | `action` | the joints' targets in the next tick [rad], then position and quaternion of the hand at its end |
+    | `next.done`, `next.success` | whether the next tick is the last one, and whether the object is then held |
+
+    Raises `BadArgument` for no closing, a closing of a single tick, or one of another hand or rate than the first;
+    `OutputError` if the folder holds other files or cannot be written; `MissingExtra` without pyarrow.
+
+    >>> import tempfile
+    >>> from torchgrasp import TrialSpec, close_hand, load_hand, load_object
+    >>> from torchgrasp.data import load_shipped_grasp
+    >>> jug, grasp, hand = load_object("jug"), load_shipped_grasp("jug", "barrett"), load_hand("barrett")
+    >>> closing = close_hand(grasp, hand, jug.mesh, TrialSpec(hold_time=0.1), parts=jug.parts)
+    >>> folder = write_lerobot(Path(tempfile.mkdtemp(), "jug"), [("lift the jug", closing)], hand)
+    >>> json.loads((folder / "meta" / "info.json").read_text())["features"]["action"]["names"][:3]
+    ['spread', 'spread_mimic', 'f1_flex']
+    """
+    import_arrow()
+    joints, rates = sorted(hand.tree.joint_names), list[float]()
+    for i, (_, x) in enumerate(episodes):
+        rates.append(round(1 / float(x.time[1] - x.time[0]), 6) if len(x.time) > 1 else 0.0)
+        same = sorted(x.joint_names) == joints and x.forces.shape[1] == len(hand.finger_names)
+        if not same or not rates[i] or rates[i] != rates[0]:
+            found = f"{len(x.time)} ticks at {rates[i]:g} Hz of {len(x.joint_names)} joints"
+            raise BadArgument(f"episodes[{i}]", found, f"a closing of {hand.name}, two ticks or more, all at one rate")
+    if not rates:
+        raise BadArgument("episodes", "none", "at least one closing")
+    files = dict(_files(episodes, hand, rates[0]))
+    digest = hashlib.sha256(b"".join(x for x in files.values() if isinstance(x, bytes))).hexdigest()
+    return write_folder(folder, {"torchgrasp": "lerobot", "frames_sha256": digest}, files.items())
+
+
+def _files(episodes: Episodes, hand: Hand, rate: float) -> Iterator[tuple[str, str | bytes]]:
+    """Yield names and contents of the files, `meta/info.json` at the end."""
+    tasks, file = list(dict.fromkeys(task for task, _ in episodes)), "chunk-000/file-000.parquet"
+    parts, joints = list[dict[str, Tensor]](), hand.tree.joint_names
+    for task, x in episodes:
+        order = [x.joint_names.index(name) for name in joints]  # simulators have their own
+        parts.append(_frames(x, order, rate, len(parts), tasks.index(task)))
+    ends = [0, *itertools.accumulate(len(part["action"]) for part in parts)]
+    frames = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    frames["index"] = torch.arange(ends[-1])
+    rows = []
+    for i, (start, end) in enumerate(itertools.pairwise(ends)):
+        row = {"episode_index": i, "tasks": [episodes[i][0]], "length": end - start}
+        row |= {"dataset_from_index": start, "dataset_to_index": end}
+        row |= {f"{of}/{index}_index": 0 for of in ("data", "meta/episodes") for index in ("chunk", "file")}
+        stats = {name: _stats(x[start:end]) for name, x in frames.items()}
+        rows.append(row | {f"stats/{name}/{key}": x for name, of in stats.items() for key, x in of.items()})
+    yield f"data/{file}", pack_table(as_table(frames, {}))
+    yield f"meta/episodes/{file}", pack_table(import_arrow().Table.from_pylist(rows))
+    words = as_table({"task_index": torch.arange(len(tasks)), "task": tasks}, {"pandas": render_card("tasks.json")})
+    yield "meta/tasks.parquet", pack_table(words)
+    yield "meta/stats.json", json.dumps({name: _stats(x) for name, x in frames.items()}, indent=1)
+    pose, fingers = ("x", "y", "z", "qx", "qy", "qz", "qw"), hand.finger_names
+    names = {"action": [*joints, *(f"hand.{x}" for x in pose)]}
+    names |= {"observation.state": names["action"], "observation.environment_state": [f"object.{x}" for x in pose]}
+    names["observation.forces"] = [f"{finger}.{axis}" for finger in fingers for axis in "xyz"]
+    features = {
+        name: {"dtype": str(x.dtype).removeprefix("torch."), "shape": [*x.shape[1:]] or [1], "names": names.get(name)}
+        for name, x in frames.items()
+    }
+    about = {"hand": hand, "rate": rate, "episodes": rows, "frames": ends[-1], "tasks": tasks, "features": features}
+    yield "README.md", render_card("lerobot.md", **about)
+    yield "meta/info.json", render_card("info.json", **about)
+
+
+def _frames(closing: ClosureResult, order: list[int], rate: float, episode: int, task: int) -> dict[str, Tensor]:
+    """Return the features of a closing's frames: all its ticks but the last one, after which nothing is done."""
+    hand, thing = _numbers(closing.hand_pose), _numbers(closing.object_pose)
+    number = torch.arange(len(hand) - 1)
+    done = number == number[-1]
+    return {
+        "observation.state": torch.cat([closing.joints[:, order], hand], 1)[:-1].float(),
+        "observation.forces": closing.trace.forces.flatten(1)[:-1].float(),
+        "observation.environment_state": thing[:-1].float(),
+        "action": torch.cat([closing.targets[:, order], hand], 1)[1:].float(),
+        "next.done": done, "next.success": done & closing.held, "timestamp": (number / rate).float(),
+        "frame_index": number, "episode_index": torch.full_like(number, episode),
+        "task_index": torch.full_like(number, task),
+    }  # fmt: skip
+
+
+def _numbers(poses: Float[Tensor, "t 4 4"]) -> Float[Tensor, "t 7"]:
+    """Return poses as positions [m] and quaternions (x, y, z, w), whose signs do not jump."""
+    turns = torch.from_numpy(spatial.transform.Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True))
+    signs = torch.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0).cumprod(0)
+    return torch.cat([poses[:, :3, 3], torch.cat([turns[:1], turns[1:] * signs[:, None]])], 1)
+
+
+def _stats(column: Tensor) -> dict[str, list[Any]]:
+    """Return statistics of each number of a feature over all frames, named as LeRobot names them."""
+    x = column.double().reshape(len(column), -1).numpy()
+    found = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
+    found |= {f"q{q:02d}": np.quantile(x, q / 100, axis=0) for q in (1, 10, 50, 90, 99)}
+    return {name: numbers.tolist() for name, numbers in found.items()} | {"count": [len(x)]}

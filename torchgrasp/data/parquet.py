@@ -1,0 +1,107 @@
+"""A campaign's data set as Parquet files with a Croissant card, which other libraries load in one line."""
+
+import itertools
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchgrasp.checks import checked
+from torchgrasp.data.reader import GraspShards
+from torchgrasp.data.tables import as_column, as_table, import_arrow, pack_table, render_card, write_folder
+from torchgrasp.errors import BadArgument, Status
+
+
+@checked
+def write_parquet(data: GraspShards, folder: Path | str) -> Path:
+    """Write a data set as Parquet with cards in Markdown and Croissant; return the folder.
+
+    In `datasets`, `load_dataset(folder)` reads a row for each grasp: the numbers of an item of `GraspShards`, with
+    object, view, hand, friction, seed and the status of each try. `load_dataset(folder, "views")` reads a row for each
+    job: its cloud and counts. The joints' names are in the cards, and in the metadata of each file's schema.
+
+    Raises `BadArgument` for no grasps, `ModelFileError` for a damaged shard, `OutputError` if the folder holds other
+    files or cannot be written, `MissingExtra` without pyarrow.
+
+    >>> import tempfile, trimesh
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.campaign import CampaignSpec, run_campaign
+    >>> from torchgrasp.data import write_objects
+    >>> from torchgrasp.evaluation import EvaluationSpec
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.ply")
+    >>> _ = write_objects(folder, folder / "objects", views=1)
+    >>> spec = CampaignSpec("dexgraspbench", EvaluationSpec(1, starts=20))
+    >>> data = run_campaign(folder / "objects", load_hand("barrett"), folder / "data", spec)
+    >>> sorted(path.name for path in write_parquet(data, folder / "parquet").iterdir())
+    ['README.md', 'croissant.json', 'grasps', 'source.json', 'views']
+    """
+    import_arrow()
+    if not len(data):
+        raise BadArgument("data", f"{len(data.jobs)} jobs without a grasp", "a data set with grasps")
+    source = {name: data.card[name] for name in ("campaign", "licence", "asked")}
+    return write_folder(folder, source, _files(data))
+
+
+def _files(data: GraspShards) -> Iterator[tuple[str, str | bytes]]:
+    """Yield names and contents of the files: for each shard its tables, at the end the cards."""
+    schemas: dict[str, Any] = {}
+    meta = {"torchgrasp": json.dumps(data.card["asked"]["hand"])}
+    for k, first in enumerate(range(0, len(data.jobs), data.size)):
+        jobs = range(first, min(first + data.size, len(data.jobs)))
+        for name, columns in (("views", _view_columns(data, jobs)), ("grasps", _grasp_columns(data, jobs))):
+            if columns:
+                table = as_table(columns, meta)
+                schemas[name] = [_describe(field) for field in table.schema]
+                yield f"{name}/shard-{k:06d}.parquet", pack_table(table)
+    tables = {name: schemas[name] for name in ("grasps", "views")}
+    yield "README.md", render_card("parquet.md", card=data.card, tables=tables)
+    yield "croissant.json", render_card("croissant.json", card=data.card, tables=tables)
+
+
+def _grasp_columns(data: GraspShards, jobs: range) -> dict[str, Any]:
+    """Return the columns of the grasps of some jobs by name, or none if the jobs have no grasp."""
+    numbers = range(data.starts[jobs.start], data.starts[jobs.stop])
+    items, asked = [data[i] for i in numbers], data.card["asked"]
+    of = [int(item["job"]) for item in items]
+    tries = itertools.chain(*(data.job(j).outcome.tolist() for j in jobs))
+    of_campaign = {
+        "hand": asked["hand"]["name"], "protocol": asked["protocol"]["name"],
+        "simulator": asked["protocol"]["trial"]["simulator"], "friction": asked["protocol"]["trial"]["friction"],
+        "seed": asked["trials"]["seed"],
+    }  # fmt: skip
+    of_view = "job", "points", "viewpoint"
+    return {} if not items else {
+        "grasp": list(numbers), "job": of,
+        **{name: [getattr(data.jobs[j], name) for j in of] for name in ("object", "view", "family", "group")},
+        **{name: [value] * len(items) for name, value in of_campaign.items()},
+        **{name: torch.stack([x[name] for x in items]) for name in items[0] if name not in of_view},
+        "outcomes": [[Status(status).name for status in of_grasp] for of_grasp in tries],
+    }  # fmt: skip
+
+
+def _view_columns(data: GraspShards, jobs: range) -> dict[str, Any]:
+    """Return the columns of some jobs by name; a view without a known camera has no viewpoint."""
+    arrow, rows, clouds = import_arrow(), data.jobs[jobs.start : jobs.stop], [data.job(j).cloud for j in jobs]
+    places, points = arrow.list_(arrow.float32(), 3), [torch.zeros(0, 3) if x is None else x.points for x in clouds]
+    eyes = [None if x is None or x.viewpoint is None else x.viewpoint.tolist() for x in clouds]
+    ends = [0, *itertools.accumulate(map(len, points))]
+    return {
+        "job": list(jobs),
+        **{name: [getattr(row, name) for row in rows] for name in ("object", "view", "family", "group")},
+        "status": [row.status.name for row in rows],
+        **{name: [getattr(row, name) for row in rows] for name in ("note", "executable", "grasps", "passed")},
+        "viewpoint": arrow.array(eyes, places),
+        "points": arrow.ListArray.from_arrays(arrow.array(ends, arrow.int32()), as_column(torch.cat(points).float())),
+    }
+
+
+def _describe(field: Any) -> dict[str, str]:
+    """Return name, kind and shape of a column; -1 in the shape is a length that differs from row to row."""
+    kind, shape = field.type, list[str]()
+    while hasattr(kind, "value_type"):
+        shape.append(str(getattr(kind, "list_size", -1)))
+        kind = kind.value_type
+    return {"name": field.name, "kind": str(kind), "shape": ",".join(shape)}
