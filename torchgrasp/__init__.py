@@ -13,7 +13,7 @@ from torchgrasp.cloud import cloud_from_depth, merge_clouds, read_cloud
 from torchgrasp.scene import Scene, read_scene, save_scene
 from torchgrasp.data.shipped import list_objects, load_object, load_scene
 from torchgrasp.shape import ShapeGP, fit_shape
-from torchgrasp.plan import certify, closure_probability, plan_contacts
+from torchgrasp.plan import Region, certify, closure_probability, plan_contacts
 from torchgrasp.hand import Hand, load_hand
 from torchgrasp.posture_model import GraspMixture, encode, fit_mixture, load_mixture, sample_configurations
 from torchgrasp.ik import solve_ik
@@ -29,7 +29,7 @@ __all__ = [
     "Certificate", "ClosureResult", "ContactCode", "ContactPlan", "Contacts", "Grasps", "PointCloud", "ShapeEstimate",
     "load_grasps", "cloud_from_depth", "merge_clouds", "read_cloud", "Scene", "read_scene", "save_scene",
     "list_objects", "load_object", "load_scene", "ShapeGP", "fit_shape",
-    "certify", "closure_probability", "plan_contacts", "Hand", "load_hand",
+    "Region", "certify", "closure_probability", "plan_contacts", "Hand", "load_hand",
     "GraspMixture", "encode", "fit_mixture", "load_mixture", "sample_configurations",
     "solve_ik", "GraspTask", "explain_success", "stream_grasps", "explain_empty", "plan_scene",
     "ClosingReference", "GraspController", "closing_gains", "close_hand",

@@ -160,6 +160,8 @@ class Status(enum.IntEnum):
     NOT_FLAT = 15, "the surface around a contact bends too sharply for a fingertip"
     BELOW_TABLE = 16, "a fingertip on its contact would be below the table"
     DEGENERATE = 17, "the contacts lie on a line or in a point: they span no virtual frame"
+    OUTSIDE = 18, "a contact lies outside the region where contacts may be (`keep`, `avoid`)"
+    NOT_RESISTED = 19, "the fingers' forces on the contacts do not resist a wrench of the task (`resist`)"
     # hand configuration
     OUT_OF_REACH = 20, "no posture of this hand spans the contacts"
     TIP_ERROR = 21, "a fingertip does not reach its contact"

@@ -2,8 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
-from typing import Annotated, Literal
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, Literal
 
 from torchgrasp.base import FINGERTIPS, Value
 from torchgrasp.checks import Force, Length, Range, checked
@@ -42,6 +42,7 @@ class ContactSpec(Value):
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
         contact_allowed: whether links may touch and push the target's neighbours; collisions then only lower the
             predicted success.
+        region: function of points (n, 3) [m], such as a `Region`, that is negative where contacts may be.
 
     Raises `BadArgument` for a number outside its range.
 
@@ -61,6 +62,7 @@ class ContactSpec(Value):
     start_radius: Annotated[float, Range(1e-06, 1.2)] = 0.9
     fingertips: Annotated[int, Range(*FINGERTIPS)] = 3
     contact_allowed: bool = False
+    region: Callable[..., Any] | None = None
 
     @property
     def plane(self) -> Plane | None:

@@ -61,6 +61,9 @@ def bad_inputs(folder):
         "open mesh": ([VIEW, *hand, "--mesh", folder / "open.ply", "--close"], ["--mesh", "open", "watertight"]),
         "missing mesh": ([VIEW, *hand, "--mesh", folder / "no.stl", "--close"], ["--mesh", "no file"]),
         "close without mesh": ([VIEW, *hand, "--close"], ["--close", "--mesh"]),
+        "open region": ([VIEW, *hand, "--keep", folder / "open.ply"], ["--keep", "open", "watertight"]),
+        "half a box": ([VIEW, *hand, "--avoid", "-1 0 0"], ["--avoid", "six numbers", "-1 0 0"]),
+        "turned box": ([VIEW, *hand, "--keep", "1 0 0 -1 1 1"], ["--keep", "less than high"]),
         "two tables": ([VIEW, *hand, "--table", "0", "--no-table"], ["--table", "--no-table"]),
         "no friction": ([VIEW, *hand, "--friction", "-1"], ["--friction", "-1"]),
         "nan friction": ([VIEW, *hand, "--friction", "nan"], ["--friction", "nan"]),
@@ -75,6 +78,18 @@ def test_grasp_refuses_bad_input_in_one_sentence_and_leaves_nothing(tmp_path, re
         error = refusal("grasp", *arguments, "--out", tmp_path / "made" / "out")
         assert all(word in error for word in words), (name, error)
         assert not (tmp_path / "made").exists()
+
+
+def test_regions_of_the_command_line_reach_the_planner(monkeypatch, run_command, tmp_path):
+    def see(*args, keep, avoid, **options):
+        points = torch.tensor([[0.0, 0.0, 0.04], [0.0, 0.0, 0.06]])
+        assert (keep(points) < 0).tolist() == [False, True]
+        assert (avoid(points) < 0).tolist() == [True, True]
+        raise MissingExtra("seen", "seen")
+
+    monkeypatch.setattr(grasps, "plan_grasps", see)
+    words = "--hand", "barrett", "--keep", "-1 -1 0.05 1 1 1", "--avoid", MESH, "--out", tmp_path / "out"
+    assert "seen" in run_command("grasp", VIEW, *words)[2]
 
 
 @pytest.mark.parametrize("name", ["a" * 300, "a/" * 3000, "a\0b", "\ud800"])

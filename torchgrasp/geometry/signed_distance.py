@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -157,6 +158,11 @@ def field_from_surface(
         known[near] = True
     to = {"device": vertices.device, "dtype": torch.float64}
     return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
+
+
+def surface_distance(vertices: Tensor, faces: Tensor) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the signed distance [m] from a triangle mesh [m] with outward faces, as a function of points (n, 3)."""
+    return _Surface(vertices, faces).distance
 
 
 def _refine(values: np.ndarray) -> np.ndarray:

@@ -116,20 +116,34 @@ def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m
 
 
 def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
-    """Return the result of `solve_closure_lp`: run the simplex method for all grasps at once, until all are optimal."""
+    """Return the result of `solve_closure_lp`, from the dual programme in the six unknowns of a wrench."""
     b, m, _ = wrench.shape
-    row = torch.arange(b, device=wrench.device)
     mean = wrench.mean(1)
-    bounds = m * (mean[:, None] - wrench)
+    found, index, multiplier = maximise(mean, m * (mean[:, None] - wrench))
+    margin = 1 / m - multiplier.sum(1)
+    phi = margin[:, None].expand(b, m).scatter_add(1, index, m * multiplier)
+    return phi, found / torch.linalg.vector_norm(found, dim=1, keepdim=True)
+
+
+def maximise(
+    objective: Float[Tensor, "b 6"], bounds: Float[Tensor, "b m 6"]
+) -> tuple[Float[Tensor, "b 6"], Int[Tensor, "b 6"], Float[Tensor, "b 6"]]:
+    """Maximise a.v with c_k.v <= 1 for all k, for objectives a and m bounds c of each row, by the simplex method.
+
+    Return the best v, or a direction in which a.v grows for ever; the six tight bounds; and their multipliers. All
+    programmes run at once, until all are optimal. The point v = 0 is feasible, so there is no first phase.
+    """
+    b, m, _ = bounds.shape
+    row = torch.arange(b, device=bounds.device)
     # The first six tight rows are artificial, v = 0 itself: they leave first, in either direction.
-    tight = wrench.new_full((b, 6), -1).long()
-    inverse = torch.eye(6, dtype=wrench.dtype, device=wrench.device).repeat(b, 1, 1)
-    slack = wrench.new_ones(b, m)
-    ray = wrench.new_zeros(b, 6)
+    tight = bounds.new_full((b, 6), -1).long()
+    inverse = torch.eye(6, dtype=bounds.dtype, device=bounds.device).repeat(b, 1, 1)
+    slack = bounds.new_ones(b, m)
+    ray = bounds.new_zeros(b, 6)
     running = torch.ones_like(row, dtype=torch.bool)
-    every = 1 if wrench.device.type == "cpu" else 16  # pivots between two looks at whether any grasp goes on
+    every = 1 if bounds.device.type == "cpu" else 16  # pivots between two looks at whether any programme goes on
     for k in range(PIVOTS):
-        multiplier = (mean[:, None] @ inverse)[:, 0]
+        multiplier = (objective[:, None] @ inverse)[:, 0]
         artificial = tight < 0
         # Leave along the edge on which the objective grows fastest; the multiplier of a bound may not be negative.
         gain = torch.where(artificial, multiplier.abs(), -multiplier)
@@ -159,15 +173,12 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
     # From the tight rows alone, so that the roundings of the pivots are gone.
     artificial = tight < 0
     index = tight.clamp(min=0)
-    identity = torch.eye(6, dtype=wrench.dtype, device=wrench.device)
+    identity = torch.eye(6, dtype=bounds.dtype, device=bounds.device)
     basis = torch.where(artificial[:, :, None], identity, bounds.gather(1, index[:, :, None].expand(b, 6, 6)))
-    vertex, _ = torch.linalg.solve_ex(basis, (~artificial).to(wrench))
-    multiplier, _ = torch.linalg.solve_ex(basis.mT, mean)
+    vertex, _ = torch.linalg.solve_ex(basis, (~artificial).to(bounds))
+    multiplier, _ = torch.linalg.solve_ex(basis.mT, objective)
     multiplier = torch.where(artificial, 0.0, multiplier)
-    margin = 1 / m - multiplier.sum(1)
-    phi = margin[:, None].expand(b, m).scatter_add(1, index, m * multiplier)
-    witness = torch.where((ray != 0).any(1, keepdim=True), ray, vertex)
-    return phi, witness / torch.linalg.vector_norm(witness, dim=1, keepdim=True)
+    return torch.where((ray != 0).any(1, keepdim=True), ray, vertex), index, multiplier
 
 
 def closed_exact(points: Vectors, normals: Vectors, friction: float, guess: Guess = None) -> Bool[Tensor, "b"]:

@@ -134,6 +134,7 @@ def check_feasibility(shape: Shape, problem: ContactProblem, points: Vectors) ->
     good = {
         Status.OUT_OF_DOMAIN: torch.linalg.vector_norm(points, dim=-1).amax(-1) <= shape.domain_radius,
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
+        Status.OUTSIDE: within(problem, points).all(-1),
         Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
         Status.BELOW_TABLE: (room >= 0).all(-1),
         Status.TOO_CLOSE: apart >= spec.least_separation,
@@ -151,6 +152,13 @@ def check_feasibility(shape: Shape, problem: ContactProblem, points: Vectors) ->
     contacts, phi = Contacts(metres, normals, jet.variance, std_m), coefficients.unflatten(1, wrench.shape[1:3])
     quality = torch.linalg.vector_norm(points.mean(1), dim=-1) * scale
     return ContactPlan(contacts, phi, quality, first_violation(good))
+
+
+def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
+    """Return which normalised points lie in the region where contacts may be; at its border by more than rounding."""
+    if problem.beyond is None:
+        return torch.ones_like(points[..., 0], dtype=torch.bool)
+    return (problem.beyond(points.flatten(0, -2)) < -1e-9).view(points.shape[:-1])
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:

@@ -12,6 +12,7 @@ tensions, and one inequality for each friction cone is left. Every inequality ha
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -123,8 +124,8 @@ class Constraints(Batch):
     """Values of all constraints, and their Jacobians by the u unknowns: point coordinates, then tensions.
 
     `centre` is the centroid of the f contacts, and `surface` their signed distances from the surface; both should be 0.
-    `bounds` should be <= 0. It holds f friction cones, f variances, f domain limits, p distances between fingertips
-    and, with a table, f heights.
+    `bounds` should be <= 0. It holds f friction cones, f variances, f domain limits, p distances between fingertips,
+    with a table f heights, and with a region f distances from it.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -161,7 +162,8 @@ class ContactProblem:
 
     `friction` is the coefficient of the largest round cone inside the friction cone with flat sides that `certify`
     uses. `separation` is the least distance of two fingertip centres, `ring` the radius within which the surface is
-    flat. The table has the normal `up` and the distance `floor` from the origin.
+    flat. The table has the normal `up` and the distance `floor` from the origin. `beyond` is the signed distance from the
+    region where contacts may be, a function of normalised points.
     """
 
     spec: ContactSpec
@@ -172,6 +174,7 @@ class ContactProblem:
     ring: PerRow
     up: Float[Tensor, "3"] | None
     floor: PerRow
+    beyond: Callable[[Tensor], Tensor] | None = None
 
     @classmethod
     def of(cls, shape: Shape, spec: ContactSpec, ring_radius: PerRow | None = None) -> "ContactProblem":
@@ -188,7 +191,8 @@ class ContactProblem:
         separation = separation.clamp_min(LEAST_SIDE) if isinstance(separation, Tensor) else max(separation, LEAST_SIDE)
         ring = (spec.ring_radius if ring_radius is None else ring_radius) / scale
         friction = spec.planned_friction * math.cos(math.pi / spec.edges)
-        return cls(spec, friction, radius, separation, spec.fingertip_radius / scale, ring, up, floor)
+        beyond = None if (region := spec.region) is None else lambda x: region(shape.metres(x)) / scale
+        return cls(spec, friction, radius, separation, spec.fingertip_radius / scale, ring, up, floor, beyond)
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
         """Return the problems of some of the rows."""
@@ -229,9 +233,21 @@ class ContactProblem:
             up = self.up.to(points)
             values.append((1 - INSIDE) * 0.1 - self.room(points, jet.normals))
             jacobians.append(own(-(up @ centre_by_point)))
+        if self.beyond is not None:
+            value, slope = self._outside(points)
+            values.append((1 - INSIDE) * 0.1 + value)
+            jacobians.append(own(slope))
         centre_by_x = torch.cat([identity.repeat(1, f) / f, identity.new_zeros(3, tension.shape[1])], 1)
         slopes = centre_by_x.expand(b, 3, unknowns), own(jet.gradient), torch.cat(jacobians, 1)
         return Constraints(points.mean(1), jet.distance, torch.cat(values, 1), *slopes)
+
+    def _outside(self, points: Vectors) -> tuple[Float[Tensor, "b f"], Vectors]:
+        """Return the distance (normalised) of contacts from where they may be, and its central differences."""
+        assert self.beyond is not None
+        step = 1e-4  # far below any region, far above rounding
+        sides = step * torch.cat([torch.eye(3), -torch.eye(3), torch.zeros(1, 3)]).to(points)
+        found = self.beyond((points[:, :, None] + sides).flatten(0, 2)).view(*points.shape[:2], 7)
+        return found[..., 6], (found[..., :3] - found[..., 3:6]) / (2 * step)
 
     def _distances(self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]) -> Bounds:
         """Return by how much each pair of fingertip centres is too close (negative if far enough), with derivatives."""

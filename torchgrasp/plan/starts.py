@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.plan.closure import Vectors, closed_exact
-from torchgrasp.plan.feasibility import normal_variation
+from torchgrasp.plan.feasibility import normal_variation, within
 from torchgrasp.plan.problem import ContactProblem, Shape, device_of, walls_of
 from torchgrasp.plan.solver import project
 from torchgrasp.specs import FLAT_RADII, ContactSpec
@@ -109,7 +109,8 @@ def draw(shape: Shape, spec: ContactSpec, size: tuple[int, int], generator: torc
 def survey(shape: Shape, spec: ContactSpec, generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
     """Return points all over the surface, from which candidates are chosen; for a vessel, half are on each wall."""
     walls = walls_of(shape)
-    drawn = draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator).tensor_split(len(walls))
+    triples = CANDIDATE_TRIPLES * (1 if spec.region is None else 4)  # few of them lie in a region
+    drawn = draw(shape, spec, (triples, 3), generator).tensor_split(len(walls))
     return torch.cat([project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)])
 
 
@@ -133,7 +134,7 @@ def qualify(shape: Shape, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tens
     distance, gradient = (x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1)))
     normals = unit(gradient)
     good = (distance.abs() < 1e-4) & (torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius)
-    good &= problem.room(points, normals) > 0
+    good &= (problem.room(points, normals) > 0) & within(problem, points)
     variance = shape.jet(points[good]).variance  # it costs more than all else
     good[good.clone()] = (variance >= 0) & (variance < spec.max_variance)
     return good, normals

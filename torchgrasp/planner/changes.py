@@ -39,7 +39,7 @@ def _with(request: Request, **fields: Any) -> Request:
 
 def list_changes(request: Request) -> list[Change]:
     """Return all changes of a request, each of one setting, that could give grasps, but not more initial guesses."""
-    kinds = (_surroundings, _fingers, _limits, _friction, _hands)
+    kinds = (_regions, _surroundings, _fingers, _limits, _friction, _hands)
     return [change for kind in kinds for change in kind(request)]
 
 
@@ -47,6 +47,14 @@ def more_starts(request: Request) -> Change:
     """Return the change of settings that makes the planner try four times as many initial guesses."""
     more = dataclasses.replace(request, starts=4 * request.starts)
     return Change(f"with {more.starts} starts", True, frozenset(Status), more)
+
+
+def _regions(request: Request) -> Iterator[Change]:
+    """Yield changes that each give up what the user asks of contacts: a region to keep to, or one to avoid."""
+    for name in ("keep", "avoid"):
+        if getattr(request, name) is not None:
+            cures = frozenset({Status.OUTSIDE}) | OPEN | OF_HAND
+            yield Change(f"without {name}", True, cures, dataclasses.replace(request, **{name: None}))
 
 
 def _fingers(request: Request) -> Iterator[Change]:

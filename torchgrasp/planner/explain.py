@@ -182,7 +182,7 @@ def explain_empty(
 ) -> Explanation:
     """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
 
-    The changes are: other fingers, another shipped hand, wider limits of contacts, higher friction, no table, no
+    The changes are: no region, other fingers, another shipped hand, wider limits of contacts, higher friction, no table, no
     neighbours, an arm that reaches everything. The search ends at a change that the user can choose and with which the
     best fifth of the guesses is likely to succeed.
 

@@ -63,6 +63,8 @@ def plan_grasps(
             `meta["promise"]` says which trials chose the bound (`torchgrasp.success.promise`).
         reachable: function that returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4) an arm reaches, in
             the frame of the cloud; by default all poses are reachable.
+        keep, avoid: a `Region` in which all contacts lie, and one in which none lies; or a function of points (n, 3)
+            [m] that returns their signed distance [m], negative inside. Contacts lie on the estimated surface.
         mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.
         ranking: criterion by which grasps are ordered, see `Ranking`; by default "success", in mode "paper" "variance".
         time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of planned guesses.
@@ -74,7 +76,7 @@ def plan_grasps(
 
     Raises:
         BadArgument: an argument of the wrong type or range; a cloud of an object that is not of graspable size; a scene
-            without a target; `shape`, `observer` or `reachable` beside several clouds.
+            without a target; `shape`, `observer`, `reachable`, `keep` or `avoid` beside several clouds.
         MissingExtra: pebble is not installed, for workers.
 
     The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps clear of the target's

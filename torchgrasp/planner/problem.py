@@ -21,6 +21,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
+from torchgrasp.plan.region import seen_from
 from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, settle_flatness
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.schedule import TRIED, TRIED_IN_SCENE, Batch, schedule
@@ -106,7 +107,8 @@ class Problem:
     @cached_property
     def flat(self) -> Settled:
         """The contact constraints, with the radius on which a contact must be flat, and the flat candidate contacts."""
-        spec = dataclasses.replace(self.given_spec, table=None if self.given_spec.table is None else 0.0)
+        table, region = None if self.given_spec.table is None else 0.0, self.given_spec.region
+        spec = dataclasses.replace(self.given_spec, table=table, region=seen_from(region, self.obj_from_upright))
         check_starts(self.shape, spec, self.request.starts)
         tips = self.hand.tips
         spec = dataclasses.replace(spec.for_fingertips(float(tips.radius.max())), fingertips=len(tips))

@@ -14,6 +14,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import with_fingers
 from torchgrasp.ik.candidates import Reachable
+from torchgrasp.plan.region import combine
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec, Mode, Ranking
@@ -28,6 +29,8 @@ Observer = Callable[[str, str, Any], None]
 """Function that is called after each stage with the stage's name, a line of text, and the stage's result."""
 
 
+Where = Callable[..., Any]
+"""A `Region`, or a function that returns the signed distance [m] of points (n, 3) [m], negative inside."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -41,6 +44,8 @@ class SceneOptions(TypedDict, total=False):
     task: GraspTask | None
     promise: Promised | None
     reachable: Reachable | None
+    keep: Where | None
+    avoid: Where | None
 
 
 class PlanOptions(SceneOptions, total=False):
@@ -76,6 +81,8 @@ class Request:
     shape: ShapeGP | None = None
     observer: Observer | None = None
     reachable: Reachable | None = None
+    keep: Where | None = None
+    avoid: Where | None = None
     time_budget: Budget | None = None
 
     def __post_init__(self) -> None:
@@ -90,10 +97,11 @@ class Request:
 
     @property
     def contact_spec(self) -> ContactSpec:
-        """The given constraints on contacts; if none are given, the default constraints of the planning mode."""
-        if self.spec is not None:
-            return self.spec
-        return ContactSpec.paper() if self.mode == "paper" else ContactSpec()
+        """The given constraints on contacts, in the given regions; by default the constraints of the planning mode."""
+        spec = self.spec or (ContactSpec.paper() if self.mode == "paper" else ContactSpec())
+        if self.keep is None and self.avoid is None:
+            return spec
+        return dataclasses.replace(spec, region=combine(self.keep, self.avoid, spec.region))
 
     @property
     def order(self) -> Ranking:

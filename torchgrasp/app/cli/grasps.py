@@ -1,6 +1,7 @@
 """The commands `torchgrasp grasp`, which plans grasps of an object in a cloud or a scene, `objects` and `view`."""
 
 import dataclasses
+import functools
 import webbrowser
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +24,7 @@ from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surfac
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.lazy import trimesh
+from torchgrasp.plan.region import Region
 from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
@@ -75,6 +77,10 @@ class Grasp(Command):
     )
     label: int | None = option(None, "label of the object to grasp in a scene; by default the easiest")
     point: tuple[float, float] | None = option(None, "column and row of a pixel on the object to grasp in a scene")
+    keep: str | None = option(
+        None, 'where contacts may be: a closed mesh, or a box as "X0 Y0 Z0 X1 Y1 Z1" [m] in the frame of the cloud'
+    )
+    avoid: str | None = option(None, "where no contact may be: a mesh or a box, as in --keep")
     no_report: bool = option(False, "write the grasps without the pages")
 
     def run(self) -> int:
@@ -84,6 +90,7 @@ class Grasp(Command):
         inputs.check_folder(out)
         scene = is_scene(path)
         self._check_choice(scene)
+        _ = self._where  # refused before any work
         hand, among = inputs.load_fingers(self.hand, self.fingers)
         return self._grasp_scene(path, out, hand, among) if scene else self._grasp_cloud(path, out, hand, among)
 
@@ -154,7 +161,12 @@ class Grasp(Command):
 
     def _task(self) -> dict[str, Any]:
         """Return the options of the planner that say what the grasps must do."""
-        return {"task": GraspTask(self.mass), "promise": self.promise}
+        return {"task": GraspTask(self.mass), "promise": self.promise, **self._where}
+
+    @functools.cached_property
+    def _where(self) -> dict[str, Region | None]:
+        """The regions of --keep and --avoid."""
+        return {name: inputs.read_region(f"--{name}", getattr(self, name)) for name in ("keep", "avoid")}
 
     def _true_mesh(self, path: Path) -> Path | None:
         """Return the path of the true mesh, or None if there is none; raise `BadArgument` if --close has no mesh."""

@@ -27,6 +27,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
+from torchgrasp.plan.region import Region
 from torchgrasp.specs import Simulator
 from torchgrasp.values import PointCloud
 
@@ -163,6 +164,20 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
     normals = None if cloud.normals is None else rotate(pose, cloud.normals)
     frustum = None if cloud.frustum is None else rotate(pose, cloud.frustum)
     return PointCloud(apply(pose, cloud.points), normals, pose[:3, 3].clone(), frustum)
+
+
+def read_region(name: str, text: str | None) -> Region | None:
+    """Return the box of six numbers in the text of option `name`, or the mesh that it names; None for None."""
+    if text is None:
+        return None
+    with naming(mesh=name, low=name, high=name):
+        try:
+            numbers = torch.tensor([float(word) for word in text.split()], dtype=torch.float64)
+        except ValueError:
+            return Region.mesh(Path(text))
+        if len(numbers) != 6:
+            raise BadArgument("mesh", repr(text), "six numbers of a box, or the file of a closed mesh")
+        return Region.box(numbers[:3], numbers[3:])
 
 
 def find_cloud(path: Path, name: str = "CLOUD") -> Path:

@@ -1,0 +1,56 @@
+"""Grasps whose contacts keep to regions: in every frame, in scenes, and explained where there are none."""
+
+import pytest
+import torch
+
+from tests.make import load_hand, random_motion, see
+from torchgrasp import ContactSpec, Region, Status, explain_empty, load_object, plan_grasps, plan_scene
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.plane import Plane, move
+
+HAND, VIEW = load_hand("barrett"), load_object("jug").view
+
+
+def test_all_contacts_are_inside_keep_and_outside_avoid_in_the_frame_of_the_caller():
+    frame = random_motion(5)
+    upper = Region.rim(VIEW, 0.0, 0.6)
+    middle = VIEW.points.double().mean(0)
+
+    def keep(points):
+        return upper(apply(inverse(frame), points))
+
+    def avoid(points):
+        return (apply(inverse(frame), points) - middle).norm(dim=-1) - 0.035
+
+    spec = ContactSpec(table=Plane.horizontal(0.0).moved(frame))
+    grasps = plan_grasps(move(VIEW, frame), HAND, spec, 10, keep=keep, avoid=avoid)
+    good = grasps.contacts.points[grasps.status == Status.OK].reshape(-1, 3)
+    assert len(good) > 0
+    assert float(keep(good).max()) < 0 < float(avoid(good).min())
+
+
+def test_without_a_grasp_in_the_region_the_region_is_what_is_changed():
+    nowhere = Region(lambda points: points[:, 2] + 1.0)
+    told = explain_empty(VIEW, HAND, ContactSpec(table=0.0), 20, keep=nowhere)
+    assert told.funnel.reason is Status.OUTSIDE
+    assert told.best is not None and told.best.words == "without keep"
+
+
+def test_the_marked_object_of_a_scene_is_held_where_it_is_marked():
+    scene = see((0.0, 0.0, 0.06, 0.12), (0.0, -0.2, 0.06, 0.14)).select(1)
+    mask = scene.pixel_labels == 1
+    rows = torch.nonzero(mask.any(1))[:, 0]
+    mask[int(rows.double().mean()) :] = False  # its lower half in the picture
+    keep = Region.mask(scene, mask)
+    grasps = plan_grasps(scene, HAND, starts=8, keep=keep)
+    good = grasps.contacts.points[grasps.status == Status.OK]
+    assert len(good) > 0 and bool((keep(good) < 0).all())
+    plan = plan_scene(scene, HAND, starts=4, avoid=Region(lambda points: -points[:, 0].abs() - 1.0))
+    assert plan.best is None and Status.OUTSIDE.sentence in plan.things[0].reason
+
+
+def test_a_region_is_of_one_cloud():
+    for name in ("keep", "avoid"):
+        with pytest.raises(BadArgument, match=name):
+            plan_grasps([VIEW, VIEW], HAND, **{name: Region.rim(VIEW, 0.0)})
