@@ -162,8 +162,8 @@ class ContactProblem:
 
     `friction` is the coefficient of the largest round cone inside the friction cone with flat sides that `certify`
     uses. `separation` is the least distance of two fingertip centres, `ring` the radius within which the surface is
-    flat. The table has the normal `up` and the distance `floor` from the origin. `beyond` is the signed distance from the
-    region where contacts may be, a function of normalised points.
+    flat. The table has the normal `up` and the distance `floor` from the origin. `beyond` returns the signed distance
+    of normalised points from the region where contacts may be.
     """
 
     spec: ContactSpec

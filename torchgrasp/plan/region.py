@@ -102,8 +102,8 @@ class Region(Value):
             wanted = f"some of the image's {tuple(image.depth.shape)} pixels"
             raise BadArgument("mask", f"{int(mask.sum())} pixels of {tuple(mask.shape)}", wanted)
         inside = np.pad(mask.cpu().numpy(), 1)  # what lies beyond the border is outside
-        pixels = ndimage.distance_transform_edt(~inside) - ndimage.distance_transform_edt(inside)
-        pixels -= np.sign(pixels) / 2  # from the middle of a pixel to its border
+        outward, inward = (np.asarray(ndimage.distance_transform_edt(x)) for x in (~inside, inside))
+        pixels = np.where(inside, 0.5 - inward, outward - 0.5)  # from the middle of a pixel to a border
         k, camera = image.intrinsics.double().cpu(), inverse(image.obj_from_camera.double()).cpu()
 
         def distance(points: Tensor) -> Tensor:

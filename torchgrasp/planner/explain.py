@@ -182,9 +182,9 @@ def explain_empty(
 ) -> Explanation:
     """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
 
-    The changes are: no region, other fingers, another shipped hand, wider limits of contacts, higher friction, no table, no
-    neighbours, an arm that reaches everything. The search ends at a change that the user can choose and with which the
-    best fifth of the guesses is likely to succeed.
+    The changes are: no region, other fingers, another shipped hand, wider limits of contacts, higher friction, no
+    table, no neighbours, an arm that reaches everything. The search ends at a change that the user can choose and with
+    which the best fifth of the guesses is likely to succeed.
 
     The work is bounded, not the time, so that a seed always gives the same explanation. A plan has at most 20 initial
     guesses and a small library of postures. Relaxed constraints are tried only where no contact set is found. At most
