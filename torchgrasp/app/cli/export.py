@@ -1,5 +1,6 @@
 """The commands `torchgrasp export` and `torchgrasp import`: grasps in the formats of other programs."""
 
+import contextlib
 import functools
 import inspect
 import itertools
@@ -11,16 +12,20 @@ import numpy as np
 
 from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
-from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
+from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, find_cloud, load_fingers
+from torchgrasp.app.report.glb import write_glb
 from torchgrasp.checks import Count
 from torchgrasp.cloud import read_cloud
 from torchgrasp.cloud.agreement import check_agreement
-from torchgrasp.errors import BadArgument, ModelFileError, Status
+from torchgrasp.errors import BadArgument, MeshError, ModelFileError, Status
 from torchgrasp.export.foreign import Quaternion, read_poses
 from torchgrasp.files import read_json, write_file
+from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
+from torchgrasp.lazy import trimesh
 from torchgrasp.planner.problem import digest
+from torchgrasp.shape import Surface, extract_surface, fit_shape
 from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
@@ -40,10 +45,11 @@ class Export(Command):
 
     grasps: Path = positional("grasps.safetensors of `torchgrasp grasp`, or a file of the folder grasps of `evaluate`")
     out: Path = required("file to write; for dexgraspbench a folder, with one file for each grasp")
-    format: Literal["json", "mujoco", "moveit", "ros2", "dexgraspbench", "graspgen"] = option(
+    format: Literal["json", "mujoco", "moveit", "ros2", "dexgraspbench", "graspgen", "glb"] = option(
         "json",
         "json: frames, units, forces and torques. mujoco: the hand as a model with keyframes. moveit: a list of "
-        "moveit_msgs/Grasp in YAML. ros2: a JointTrajectory each. dexgraspbench, graspgen: files of these projects",
+        "moveit_msgs/Grasp in YAML. ros2: a JointTrajectory each. dexgraspbench, graspgen: files of these projects. "
+        "glb: hand and object at the best grasp, for slides",
     )
     hand: str | None = option(None, "name or folder of the hand; by default the name in the file")
     most: Count = option(20, "number of grasps, the best first")
@@ -52,7 +58,9 @@ class Export(Command):
         None, "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's"
     )
     object: str | None = option(
-        None, "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the object's id"
+        None,
+        "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the object's id; "
+        "glb: a mesh, or the cloud of the plan for the estimated surface",
     )
     rename: tuple[str, ...] = option(
         (), "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file of such an object"
@@ -64,9 +72,9 @@ class Export(Command):
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return the exit code."""
-        named = self.format in ("dexgraspbench", "graspgen")
+        named = self.format in ("dexgraspbench", "graspgen", "glb")
         if (self.object is None) == named and self.format != "moveit":
-            wanted = "a path with --format dexgraspbench or graspgen, or an id with moveit, and with these alone"
+            wanted = "a path with --format dexgraspbench, graspgen or glb, or an id with moveit, and with these alone"
             raise BadArgument("--object", self.object, wanted)
         with naming(path="--flange"):
             flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
@@ -86,12 +94,27 @@ class Export(Command):
             if self.format == "dexgraspbench":
                 stiffness = {} if self.kp is None else {"kp": self.kp}
                 formats.save_dexgraspbench(hand, best, self.out, str(self.object), self.force, **stiffness)
+            elif self.format == "glb":
+                if len(best):
+                    write_glb(self.out, hand, best[0], self._body(planned))
             elif self.format == "graspgen":
                 write_file(self.out, formats.format_graspgen(best, str(self.object)))
             else:
                 write_file(self.out, TEXTS[self.format](hand, best, self.force, self.kp, **robot))
         print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
         return 0 if len(best) else 1
+
+    def _body(self, planned: Grasps) -> "Surface | trimesh.Trimesh":
+        """Read the object of --format glb: a mesh, or the surface that the cloud of the plan tells."""
+        path = find_cloud(Path(str(self.object)), "--object")
+        with contextlib.suppress(BadArgument):
+            cloud = read_cloud(path)
+            if digest(cloud) == planned.meta.get("cloud_sha256"):
+                return extract_surface(fit_shape(cloud, seed=int(planned.meta["seed"]), table=planned.table))
+        try:
+            return read_mesh(path)
+        except MeshError as error:
+            raise BadArgument("--object", error.found, f"{error.allowed}, or the cloud of the plan") from error
 
 
 def read_names(words: Sequence[str]) -> dict[str, str] | None:

@@ -1,0 +1,88 @@
+"""A grasp as one GLB file, with the links of the hand and the object as coloured parts, for slides and 3D viewers."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchgrasp.app.report.canvas import OBJECT, map_colors, rgb
+from torchgrasp.app.report.solids import link_poses, solids_of_links
+from torchgrasp.app.report.stills import to_array
+from torchgrasp.checks import checked
+from torchgrasp.control.reference import check_single
+from torchgrasp.files import write_file
+from torchgrasp.hand.hand import Hand
+from torchgrasp.lazy import spatial, trimesh
+from torchgrasp.shape.surface import Surface
+from torchgrasp.values import Grasps
+
+
+@checked
+def write_glb(path: Path | str, hand: Hand, grasp: Grasps, body: "Surface | trimesh.Trimesh") -> Path:
+    """Write a hand at a single grasp with the object as one GLB file (binary glTF 2.0, metres, y up), atomically.
+
+    The nodes have the names of the hand's links, in the colours of their fingers, and "object". The `body` is a mesh
+    [m] in the frame of the grasp, or the estimated surface, which is coloured by its standard deviation. Returns the
+    path. Raises `BadArgument` if there is not exactly one grasp, `OutputError` if the file cannot be written.
+
+    >>> import tempfile
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "barrett")
+    >>> file = write_glb(Path(tempfile.mkdtemp(), "jug.glb"), load_hand("barrett"), grasp, jug.mesh)
+    >>> sorted(trimesh.load_scene(file).geometry)[:3]
+    ['f1_dist', 'f1_med', 'f1_prox']
+    """
+    check_single(grasp)
+    up = np.array([0.0, 0.0, 1.0]) if grasp.table is None else to_array(grasp.table.normal)
+    y_up = np.eye(4)
+    y_up[:3, :3] = spatial.transform.Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0].as_matrix()
+    scene = trimesh.Scene()
+    scene.add_geometry(_solid(body), geom_name="object", node_name="object", transform=y_up)
+    joints, names = hand.expand_joints(grasp.joints.double()), hand.tree.joint_names
+    poses = link_poses(hand, joints, names, grasp.obj_from_hand)[0].cpu().numpy()
+    solids = solids_of_links(hand)
+    for link, name in enumerate(hand.tree.link_names):
+        if mine := [s for s in solids if s.link == link]:
+            points, normals = np.concatenate([s.vertices for s in mine]), np.concatenate([s.normals for s in mine])
+            starts = np.cumsum([0, *(len(s.vertices) for s in mine)])
+            faces = np.concatenate([s.faces + start for s, start in zip(mine, starts, strict=False)])
+            shape = trimesh.Trimesh(points, faces, vertex_normals=normals, visual=_paint(mine[0].color), process=False)
+            scene.add_geometry(shape, geom_name=name, node_name=name, transform=y_up @ poses[link])
+    data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=_soften)
+    assert isinstance(data, bytes)
+    return write_file(path, data)
+
+
+def _solid(body: "Surface | trimesh.Trimesh") -> "trimesh.Trimesh":
+    """Return the object as a mesh: in one colour, or an estimated surface by its standard deviation."""
+    if not isinstance(body, Surface):
+        return trimesh.Trimesh(body.vertices, body.faces, visual=_paint(OBJECT), process=False)
+    std_m, normals = to_array(body.std_m), to_array(body.normals)
+    colors = np.uint8(255 * _linear(map_colors(std_m / max(float(np.quantile(std_m, 0.99)), 1e-6), "viridis")))
+    points, faces = to_array(body.vertices), body.faces.cpu().numpy()
+    return trimesh.Trimesh(points, faces, vertex_normals=normals, vertex_colors=colors, process=False)
+
+
+def _paint(color: str) -> Any:
+    """Return a material of a colour, as trimesh keeps it."""
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    return TextureVisuals(material=PBRMaterial(baseColorFactor=[*_linear(np.array(rgb(color))), 1.0]))
+
+
+def _linear(colors: np.ndarray) -> np.ndarray:
+    """Return sRGB colours in [0, 1] as linear light, which glTF stores."""
+    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+
+
+def _soften(tree: dict[str, Any]) -> None:
+    """Make every part of a glTF tree matt plastic: by default a part is a mirror of metal."""
+    matt = {"metallicFactor": 0.0, "roughnessFactor": 0.6}
+    materials = tree.setdefault("materials", [])
+    for material in materials:
+        material["pbrMetallicRoughness"].update(matt)
+    for part in (part for mesh in tree["meshes"] for part in mesh["primitives"] if "material" not in part):
+        part["material"] = len(materials)
+        materials.append({"pbrMetallicRoughness": dict(matt)})
