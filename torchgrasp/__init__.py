@@ -9,7 +9,7 @@ from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Certificate, ContactCode, ContactPlan, Contacts, Grasps, PointCloud, ShapeEstimate
 from torchgrasp.values import load_grasps
 from torchgrasp.closure import ClosureResult, SensorModel
-from torchgrasp.cloud import cloud_from_depth, merge_clouds, read_cloud
+from torchgrasp.cloud import cloud_from_array, cloud_from_depth, merge_clouds, read_cloud
 from torchgrasp.scene import Scene, read_scene, save_scene
 from torchgrasp.data.shipped import list_objects, load_object, load_scene
 from torchgrasp.shape import ShapeGP, fit_shape
@@ -27,8 +27,8 @@ __version__ = "0.1.0"
 __all__ = [
     "plan_grasps", "GraspError", "Status", "Plane", "ContactSpec", "SensorModel", "TrialSpec",
     "Certificate", "ClosureResult", "ContactCode", "ContactPlan", "Contacts", "Grasps", "PointCloud", "ShapeEstimate",
-    "load_grasps", "cloud_from_depth", "merge_clouds", "read_cloud", "Scene", "read_scene", "save_scene",
-    "list_objects", "load_object", "load_scene", "ShapeGP", "fit_shape",
+    "load_grasps", "cloud_from_array", "cloud_from_depth", "merge_clouds", "read_cloud", "Scene", "read_scene",
+    "save_scene", "list_objects", "load_object", "load_scene", "ShapeGP", "fit_shape",
     "Region", "certify", "closure_probability", "plan_contacts", "Hand", "load_hand",
     "GraspMixture", "encode", "fit_mixture", "load_mixture", "sample_configurations",
     "solve_ik", "GraspTask", "explain_success", "stream_grasps", "explain_empty", "plan_scene",

@@ -29,8 +29,8 @@ from torchgrasp.errors import BadArgument
 # isort: off
 from torchgrasp.marks import (  # noqa: F401
     ANY, DTYPES, FINITE, LEAST, MOST, NUMBERS, RIGID, Count, Force, Fraction, Length, Measured, Pose, Poses, Positive,
-    Range, Rows, Seed, check_dense, check_moved, check_path, describe, fits, is_known, is_rigid, is_tensor, is_tracked,
-    show,
+    Range, Rows, Seed, Taken, check_dense, check_moved, check_path, describe, fits, is_known, is_rigid, is_tensor,
+    is_tracked, show,
 )  # fmt: skip
 # isort: on
 
@@ -69,9 +69,8 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
     NumPy numbers become Python numbers. If an argument is a value, its fields are checked again. In a method, a letter
     in a shape has the same size as in the fields of the object. A value without `__post_init__` that the library makes
     from tensors is not checked. With `gradients` True, the function is differentiable: it takes tensors that require a
-    gradient, dual tensors and tensors inside a transform of torch.func. All other functions refuse these tensors.
-    Numbers inside torch.vmap and arguments inside torch.compile are not checked. A call raises `BadArgument` if an
-    argument has a wrong type, shape, dtype or range, or a number that is not finite.
+    gradient, dual tensors and tensors inside a transform of torch.func, which other functions refuse. Numbers inside
+    torch.vmap and arguments inside torch.compile are not checked. A wrong argument raises `BadArgument`.
     """
     if thing is None:
         return functools.partial(checked, gradients=gradients)
@@ -98,8 +97,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             shared.sizes.update(_lengths(bound.arguments["self"]))
         for name, value in bound.arguments.items():
             if several.get(name) == inspect.Parameter.VAR_KEYWORD and name in hints:
-                read = {key: _read(key, x, _option(hints[name], key), shared) for key, x in value.items()}
-                bound.arguments[name] = read
+                bound.arguments[name] = {k: _read(k, x, _option(hints[name], k), shared) for k, x in value.items()}
             elif name in hints:
                 hint = tuple[hints[name], ...] if name in several else hints[name]
                 bound.arguments[name] = _read(name, value, hint, shared)
@@ -184,6 +182,8 @@ def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> An
     """Return an argument if it satisfies the rule in its annotation, such as a range; else raise `BadArgument`."""
     if isinstance(mark, Range):
         return read_number(name, value, hint, mark)
+    if isinstance(mark, Taken):
+        return _read(name, mark.read(value, name), mark.kind, call)
     if mark == ANY and hint is float and isinstance(value, float):
         return value
     if mark == ANY and not call.strict:

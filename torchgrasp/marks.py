@@ -5,6 +5,7 @@ import os
 import sys
 import types
 import typing
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -30,6 +31,15 @@ class Rows(NamedTuple):
     """Annotation of a field that holds a batch, with as many rows as the axis `letter` of the other fields is long."""
 
     letter: str
+
+
+class Taken(NamedTuple):
+    """A rule in an annotation called `alias`: `read`, given an argument and its name, makes a value of a `kind`."""
+
+    alias: str
+    kind: Any
+    words: str
+    read: Callable[[Any, str], Any]
 
 
 ANY, FINITE = "any number, NaN and infinity too", "finite numbers in every field"
@@ -59,7 +69,7 @@ def describe(hint: Any) -> str:
         kind, (low, high, words) = "a whole number" if inside[0] is int else "a number", inside[1]
         return words or f"{kind} in [{low:.12g}, {high:.12g}]"
     if origin is Annotated:
-        return describe(inside[0])
+        return inside[1].words if isinstance(inside[1], Taken) else describe(inside[0])
     if origin in (typing.Union, types.UnionType):
         return " or ".join(dict.fromkeys(describe(x) for x in inside if x is not int or float not in inside))
     if origin is typing.Literal:

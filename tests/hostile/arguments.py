@@ -20,7 +20,7 @@ from torch import Tensor
 
 import torchgrasp
 from tests.hostile.samples import Lengths, hints_of, sample, sample_tensor
-from torchgrasp.checks import ANY, RIGID, Range, _lengths
+from torchgrasp.checks import ANY, RIGID, Range, Taken, _lengths
 from torchgrasp.errors import Status
 
 NAN, INF = float("nan"), float("inf")
@@ -112,6 +112,8 @@ def is_wrong(value: Any, hint: Any) -> bool:
         elif one in (int, float):
             if is_number(value, one) and abs(value) < (2**63 if one is int else 1e308):
                 return False
+        elif origin is typing.Annotated and isinstance(inside[1], Taken):
+            hints.append(inside[0])
         else:
             with jaxtyped("context"):
                 if not isinstance(value, Tensor) or tensors_in(one) or one is Tensor:  # beartype asks for their length
@@ -142,7 +144,8 @@ def tensors_in(hint: Any) -> list[Any]:
     if origin in (typing.Union, types.UnionType):
         return [x for part in inside for x in tensors_in(part)]
     if origin is typing.Annotated:
-        return [hint] if tensors_in(inside[0]) else []
+        found = tensors_in(inside[0])
+        return found if isinstance(inside[1], Taken) else [hint] * bool(found)
     return [hint] if isinstance(hint, type) and issubclass(hint, AbstractArray) and hint.array_type is Tensor else []
 
 

@@ -16,6 +16,7 @@ from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.cloud.agreement import check_agreement, check_stand
 from torchgrasp.control.reference import check_single
+from torchgrasp.data.shipped import GraspObject
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
@@ -24,6 +25,7 @@ from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import hand_of
 from torchgrasp.lazy import trimesh
 from torchgrasp.sim.scene_spec import Neighbour
 from torchgrasp.specs import TrialSpec
@@ -38,8 +40,8 @@ PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre during the closing t
 @single_threaded
 def close_hand(
     grasp: Grasps,
-    hand: Hand,
-    mesh: "trimesh.Trimesh | Path | str",
+    hand: Hand | Path | str,
+    mesh: "trimesh.Trimesh | Path | str | GraspObject",
     spec: TrialSpec | None = None,
     seed: Seed = 0,
     *,
@@ -59,8 +61,8 @@ def close_hand(
 
     Args:
         grasp: a single grasp.
-        hand: the hand of the grasp.
-        mesh: the true object [m], closed, in the frame of the grasp: a trimesh or a file.
+        hand: the hand of the grasp, or its name or folder.
+        mesh: the true object [m], closed, in the frame of the grasp: a trimesh, a file, or a `GraspObject` with parts.
         spec: parameters of the trial; `TrialSpec()` by default.
         seed: random seed of the tactile sensors' noise.
         error: true pose of the hand in its planned frame, unknown to the controller; by default the planned pose.
@@ -79,15 +81,17 @@ def close_hand(
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
 
-    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> jug, grasp, hand = load_object("jug"), load_shipped_grasp("jug", "allegro"), load_hand("allegro")
-    >>> result = close_hand(grasp, hand, jug.mesh, TrialSpec(hold_time=0.2), parts=jug.parts)
+    >>> grasp = load_shipped_grasp("jug", "allegro")
+    >>> result = close_hand(grasp, "allegro", load_object("jug"), TrialSpec(hold_time=0.2))
     >>> result.held, result.slip.distance < 0.01, result.disturbance.early, result.trace.forces.shape[1:]
     (True, True, tensor([False, False, False]), torch.Size([3, 3]))
     """
     check_single(grasp)
-    mesh = read_mesh(mesh)
+    if isinstance(mesh, GraspObject):
+        mesh, parts = mesh.mesh, mesh.parts if parts is None else parts
+    mesh, hand = read_mesh(mesh), hand if isinstance(hand, Hand) else hand_of(grasp, hand)
     check_agreement("mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99)
     if table is not None:
         check_stand(mesh, table)

@@ -2,10 +2,10 @@
 
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.grasps import plan_grasps, stream_grasps
-from torchgrasp.planner.request import PlanOptions
+from torchgrasp.planner.request import PlanOptions, SceneOptions
 from torchgrasp.planner.scene import ScenePlan, ThingPlan, plan_scene
 
 __all__ = [
-    "Explanation", "PlanOptions", "ScenePlan", "ThingPlan", "explain_empty", "plan_grasps", "plan_scene",
-    "stream_grasps",
+    "Explanation", "PlanOptions", "SceneOptions", "ScenePlan", "ThingPlan", "explain_empty", "plan_grasps",
+    "plan_scene", "stream_grasps",
 ]  # fmt: skip

@@ -15,18 +15,17 @@ from typing_extensions import Unpack
 
 from torchgrasp.base import Value, count_status
 from torchgrasp.checks import Count, Seed, checked
+from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
 from torchgrasp.errors import Status
-from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.batches import Planner, rank_together
 from torchgrasp.planner.changes import Change, list_changes, more_starts
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.request import Observer, PlanOptions, Request, show_options
 from torchgrasp.planner.run import expected_success
 from torchgrasp.planner.stack import Stack
-from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
-from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds, PointCloud
+from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds
 
 MOST_TRIALS = 8  # most changes that are tried
 
@@ -173,8 +172,8 @@ class Explanation(Value):
 @checked
 @single_threaded
 def explain_empty(
-    cloud: PointCloud | Scene,
-    hand: Hand,
+    cloud: SeenLike,
+    hand: HandLike,
     spec: ContactSpec | None = None,
     starts: Count = 1000,
     seed: Seed = 0,
@@ -203,7 +202,7 @@ def explain_empty(
     'if the friction were 0.4 instead of 0'
     """
     starts_tried = 20  # starts with which a change is tried: one change takes about a second
-    request = Request(cloud, hand, spec, starts, seed, **options)
+    request = Request(as_seen(cloud, "cloud"), as_hand(hand, "hand"), spec, starts, seed, **options)
     deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
     few = dataclasses.replace(request, starts=min(starts, starts_tried))
     funnel, _, problem = try_request(few, first=request.tell)

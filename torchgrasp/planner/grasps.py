@@ -6,33 +6,32 @@ from typing import Annotated, overload
 from typing_extensions import Unpack
 
 from torchgrasp.checks import Count, Range, Seed, checked
+from torchgrasp.data.accept import CloudLike, HandLike, SeenLike, as_cloud, as_hand, as_seen
 from torchgrasp.errors import BadArgument
-from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.many import plan_many
 from torchgrasp.planner.request import PlanOptions, Request, show_options
 from torchgrasp.planner.run import plan_request, stream_request
-from torchgrasp.scene.scene import Scene
 from torchgrasp.specs import ContactSpec
 from torchgrasp.threads import single_threaded
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.values import Grasps
 
 
 @overload
 def plan_grasps(
-    cloud: PointCloud | Scene, hand: Hand, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0,
+    cloud: SeenLike, hand: HandLike, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0,
     **options: Unpack[PlanOptions],
 ) -> Grasps: ...  # fmt: skip
 @overload
 def plan_grasps(
-    cloud: Sequence[PointCloud], hand: Hand, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0, *,
-    workers: Annotated[int, Range(0, 1024)] = 0, **options: Unpack[PlanOptions],
+    cloud: Sequence[CloudLike], hand: HandLike, spec: ContactSpec | None = None, starts: Count = 1000, seed: Seed = 0,
+    *, workers: Annotated[int, Range(0, 1024)] = 0, **options: Unpack[PlanOptions],
 ) -> list[Grasps]: ...  # fmt: skip
 @show_options
 @checked
 @single_threaded
 def plan_grasps(
-    cloud: PointCloud | Scene | Sequence[PointCloud],
-    hand: Hand,
+    cloud: SeenLike | Sequence[CloudLike],
+    hand: HandLike,
     spec: ContactSpec | None = None,
     starts: Count = 1000,
     seed: Seed = 0,
@@ -42,15 +41,17 @@ def plan_grasps(
 ) -> Grasps | list[Grasps]:
     """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene, the best grasp first.
 
-    >>> from torchgrasp import load_hand, load_object
-    >>> grasps = plan_grasps(load_object("cylinder").view, load_hand("barrett"), ContactSpec(table=0.0), starts=20)
+    >>> from torchgrasp import load_object
+    >>> grasps = plan_grasps(load_object("cylinder"), "barrett", ContactSpec(table=0.0), starts=20)
     >>> grasps.joints.shape[1]
     4
 
     Args:
-        cloud: points that a camera saw [m]; missing normals and viewpoint are estimated. Or a `Scene` with a target. A
-            sequence of clouds gives a list of results; a bad cloud has none, and `meta["refused"]` holds the reason.
-        hand: from `load_hand`; it is moved to the device of the cloud.
+        cloud: points that a camera saw [m], in any frame; the grasps are in this frame. A `PointCloud`, a `Scene` with
+            a target, an array or tensor (n, 3), a cloud of Open3D or trimesh, a file for `read_cloud` or `read_scene`,
+            or a `GraspObject`. Missing normals and viewpoint are estimated; `cloud_from_array` takes them. A sequence
+            gives a list of results; a bad cloud has no grasps, and `meta["refused"]` holds the reason.
+        hand: from `load_hand`, or its name or folder; it is moved to the device of the cloud.
         spec: the constraints on contacts; by default `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
@@ -83,20 +84,20 @@ def plan_grasps(
     neighbours and of space that is probably full. The remaining risk of collision lowers `Grasps.success`. Grasps are
     planned in batches, each larger than the one before. `stream_grasps` yields each batch when it ends.
     """
-    given = {"hand": hand, "spec": spec, "starts": starts, "seed": seed, **options}
-    if isinstance(cloud, Sequence):
-        return plan_many(cloud, workers, given)
+    given = {"hand": as_hand(hand, "hand"), "spec": spec, "starts": starts, "seed": seed, **options}
+    if isinstance(cloud, Sequence) and not isinstance(cloud, str):
+        return plan_many([as_cloud(one, "cloud") for one in cloud], workers, given)
     if workers:
         raise BadArgument("workers", workers, "0 for a single cloud")
-    return plan_request(Request(cloud, **given))
+    return plan_request(Request(as_seen(cloud, "cloud"), **given))
 
 
 @show_options
 @checked
 @single_threaded
 def stream_grasps(
-    cloud: PointCloud | Scene,
-    hand: Hand,
+    cloud: SeenLike,
+    hand: HandLike,
     spec: ContactSpec | None = None,
     starts: Count = 1000,
     seed: Seed = 0,
@@ -114,4 +115,4 @@ def stream_grasps(
     >>> bool((first.status == 0).all())
     True
     """
-    return stream_request(Request(cloud, hand, spec, starts, seed, **options))
+    return stream_request(Request(as_seen(cloud, "cloud"), as_hand(hand, "hand"), spec, starts, seed, **options))

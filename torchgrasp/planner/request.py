@@ -4,11 +4,12 @@ import dataclasses
 import inspect
 import math
 import re
+import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypedDict, TypeVar
 
-from torchgrasp.checks import Count, Range, Seed, checked
+from torchgrasp.checks import Count, Range, Seed, Taken, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
@@ -127,16 +128,27 @@ class _Plain(str):
 
 def show_options(function: Function) -> Function:
     """Return the function, whose signature names each option in place of `**options`, and each type in plain words."""
-    signature, hints = inspect.signature(function), typing.get_type_hints(function)
-    inner = typing.get_type_hints(typing.get_args(hints.pop("options"))[0])
+    signature, hints = inspect.signature(function), typing.get_type_hints(function, include_extras=True)
+    inner = typing.get_type_hints(typing.get_args(hints.pop("options"))[0], include_extras=True)
     defaults = {field.name: field.default for field in dataclasses.fields(Request)}
     named = [one for one in signature.parameters.values() if one.name in hints]
     named += [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name]) for name in inner]
-    words = {k: _Plain(re.sub(r"\b(\w+\.)+", "", inspect.formatannotation(x))) for k, x in (hints | inner).items()}
-    parameters = [one.replace(annotation=words[one.name]) for one in named]
-    shown = signature.replace(parameters=parameters, return_annotation=words["return"])
+    parameters = [one.replace(annotation=_Plain(_shorten((hints | inner)[one.name]))) for one in named]
+    shown = signature.replace(parameters=parameters, return_annotation=_Plain(_shorten(hints["return"])))
     setattr(function, "__signature__", shown)  # noqa: B010
     return function
+
+
+def _shorten(hint: Any) -> str:
+    """Return a type as text, without the names of modules and without rules."""
+    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        return inside[1].alias if isinstance(inside[1], Taken) else _shorten(inside[0])
+    if origin in (typing.Union, types.UnionType):
+        return " | ".join(map(_shorten, inside))
+    if origin is Sequence:
+        return f"Sequence[{_shorten(inside[0])}]"
+    return "None" if hint is type(None) else re.sub(r"\b(\w+\.)+", "", inspect.formatannotation(hint))
 
 
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:

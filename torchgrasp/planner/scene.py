@@ -10,8 +10,8 @@ from typing_extensions import Unpack
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Count, Fraction, Measured, Seed, checked
+from torchgrasp.data.accept import HandLike, SceneLike, as_hand, as_scene
 from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status
-from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease
 from torchgrasp.planner.grasps import plan_grasps
@@ -68,8 +68,8 @@ class ScenePlan(Value):
 @checked
 @single_threaded
 def plan_scene(
-    scene: Scene,
-    hand: Hand,
+    scene: SceneLike,
+    hand: HandLike,
     spec: ContactSpec | None = None,
     starts: Count = 1000,
     seed: Seed = 0,
@@ -85,8 +85,8 @@ def plan_scene(
     without objects, or an argument of the wrong type or range.
 
     Args:
-        scene: objects on a table.
-        hand: from `load_hand`.
+        scene: objects on a table, or a file of `save_scene`.
+        hand: from `load_hand`, or its name or folder.
         spec: the constraints on contacts; `ContactSpec()` by default.
         starts: number of random initial guesses of the contact planner for each object.
         seed: random seed.
@@ -98,6 +98,7 @@ def plan_scene(
     >>> plan.best.success > 0.5, plan.things[-1].reason
     (True, 'not tried: another object is easy enough')
     """
+    scene, hand = as_scene(scene, "scene"), as_hand(hand, "hand")
     if not scene.things:
         raise BadArgument("scene", "no object on the table", "a scene with at least one object")
     finger_sets(hand, options.get("fingers"))  # raises for unknown fingers

@@ -16,6 +16,7 @@ from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
+from torchgrasp.data.accept import CloudLike, as_cloud
 from torchgrasp.errors import BadArgument, CutOff, FewPoints, Flat, Gap, TwoBodies
 from torchgrasp.geometry.plane import Plane, as_plane, round_upright, upright_frame
 from torchgrasp.shape.completion.complete import complete_cloud
@@ -51,7 +52,7 @@ MAX_BUDGET = 1000  # greatest number of observed points: their factor has 4000 r
 @checked
 @single_threaded
 def fit_shape(
-    cloud: PointCloud,
+    cloud: CloudLike,
     noise: Annotated[float, Range(LEAST, 1.0)] = 0.01,
     budget: Annotated[int, Range(OUTER_POINTS + 5, MAX_BUDGET)] | Literal["sure"] | None = None,
     psi_scale: Annotated[float, Range(1.0, 100.0)] = 1.5,
@@ -70,8 +71,8 @@ def fit_shape(
     With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1, and 20 random points around it at +1.
 
     Args:
-        cloud: points [m] of one object from one view or several (`merge_clouds`); `prepare_cloud` is applied. Normals,
-            if they are given, tell whether the points cover the whole surface. Walls thinner than the cloud's spacing
+        cloud: points [m] of one object from one view or several (`merge_clouds`), as in `plan_grasps`. Normals, if
+            they are given, tell whether the points cover the whole surface. Walls thinner than the cloud's spacing
             merge, but an open vessel seen from above on a `table` becomes a `HollowShape` with two surfaces.
         noise: standard deviation of an observed signed distance, in radii of the object. If `support` is "paper",
             also of a normal.
@@ -99,6 +100,7 @@ def fit_shape(
     >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
     tensor(True)
     """
+    cloud = as_cloud(cloud, "cloud")
     if isinstance(kernel, Kernel) and not is_plain(kernel.profile(cloud.points.new_zeros(()))):
         raise BadArgument("kernel", "a profile with tensors that require a gradient", "numbers: use `condition`")
     plane, cloud = as_plane(table), remove_duplicates(cloud)

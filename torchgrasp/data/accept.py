@@ -1,0 +1,129 @@
+"""What public functions take in place of a cloud, a scene or a hand: arrays, clouds of other programs, files, names.
+
+The border (`checked`) turns it into a value, so that all other functions take values alone.
+"""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.checks import Taken, check_path, show
+from torchgrasp.cloud.read import make_cloud, read_cloud_file
+from torchgrasp.data.shipped import GraspObject
+from torchgrasp.errors import BadArgument
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import find_hand, hands_folder, load_hand
+from torchgrasp.scene.file import read_scene
+from torchgrasp.scene.image import is_scene
+from torchgrasp.scene.scene import Scene
+from torchgrasp.values import PointCloud
+
+Read = TypeVar("Read")
+CLOUD = (
+    "a PointCloud, an array (n, 3) in metres (cloud_from_array takes normals and the camera's position, too), "
+    "a cloud of Open3D or trimesh, a file or a GraspObject"
+)
+SCENE, HAND = "a Scene, or a file of save_scene", "a Hand, the name of a shipped hand, or the folder of another hand"
+
+
+@runtime_checkable
+class _Open3D(Protocol):
+    """A cloud of Open3D: it has `points`, and perhaps `normals`."""
+
+    points: Any
+
+
+@runtime_checkable
+class _Trimesh(Protocol):
+    """A cloud of trimesh: it has `vertices`."""
+
+    vertices: Any
+
+
+def _named(read: Callable[[Any], Read]) -> Callable[[Any, str], Read]:
+    """Return a reader whose errors name the argument that it reads."""
+
+    @functools.wraps(read)
+    def call(value: Any, name: str) -> Read:
+        try:
+            if isinstance(value, str | Path):
+                check_path(name, value)
+            return read(value)
+        except BadArgument as error:
+            raise type(error)(name, error.found, error.allowed) from error
+
+    return call
+
+
+@_named
+def as_cloud(value: Any) -> PointCloud:
+    """Return a value as a cloud, in metres in its own frame; an array's camera is unknown."""
+    if isinstance(value, PointCloud):
+        return value
+    if isinstance(value, GraspObject):
+        return value.view
+    if isinstance(value, str | Path):
+        return read_cloud_file(value).cloud
+    if isinstance(value, Tensor):
+        return PointCloud(value)
+    if isinstance(value, np.ndarray):
+        return make_cloud("an array", {"columns": value}).cloud
+    for surface in ("faces", "triangles"):
+        if hasattr(value, surface):
+            raise BadArgument("cloud", f"a mesh ({show(value)})", f"points that a camera saw: {CLOUD}")
+    points = getattr(value, "points", getattr(value, "vertices", None))
+    if points is None or isinstance(value, Value):
+        raise BadArgument("cloud", show(value), CLOUD)
+    normals = np.asarray(getattr(value, "normals", []))
+    arrays = {"points": np.asarray(points), "normals": normals if normals.size else None}
+    return make_cloud(f"a {type(value).__name__}", arrays).cloud
+
+
+@_named
+def as_scene(value: Any) -> Scene:
+    """Return a value as a scene; a file is read."""
+    if isinstance(value, str | Path):
+        return read_scene(value)
+    if not isinstance(value, Scene):
+        raise BadArgument("scene", show(value), SCENE)
+    return value
+
+
+@_named
+def as_seen(value: Any) -> PointCloud | Scene:
+    """Return a value as a scene if it is one or a file of one, else as a cloud."""
+    scene = isinstance(value, Scene) or (isinstance(value, str | Path) and is_scene(Path(value)))
+    return as_scene(value, "cloud") if scene else as_cloud(value, "cloud")
+
+
+@_named
+def as_hand(value: Any) -> Hand:
+    """Return a value as a hand; a shipped hand is loaded once, so that what the planner derives from it is kept."""
+    if isinstance(value, Hand):
+        return value
+    if not isinstance(value, str | Path):
+        raise BadArgument("hand", show(value), HAND)
+    folder = find_hand(value)
+    return _load_shipped(folder.name) if folder.parent == hands_folder() else load_hand(folder)
+
+
+@functools.cache
+def _load_shipped(name: str) -> Hand:
+    return load_hand(name)
+
+
+Given = PointCloud | np.ndarray | Float[Tensor, "n 3"] | Path | str | GraspObject | _Open3D | _Trimesh
+CloudLike = Annotated[Given, Taken("CloudLike", PointCloud, CLOUD, as_cloud)]
+"""A cloud, or what becomes one: points are in metres, in the frame of the results; the camera is as a rule unknown."""
+SceneLike = Annotated[Scene | Path | str, Taken("SceneLike", Scene, SCENE, as_scene)]
+"""A scene, or a file of one."""
+SeenLike = Annotated[Given | Scene, Taken("SeenLike", PointCloud | Scene, f"{CLOUD}, or a Scene", as_seen)]
+"""What a camera saw: a cloud or a scene, or what becomes one."""
+HandLike = Annotated[Hand | Path | str, Taken("HandLike", Hand, HAND, as_hand)]
+"""A hand, or a name or folder for `load_hand`."""
