@@ -5,6 +5,7 @@
 takes what a drive exerts beyond the free motion, stiffness times lag, as the torque of a contact.
 """
 
+import contextlib
 import dataclasses
 import gc
 import json
@@ -127,6 +128,7 @@ class HandLoop:
 def main() -> None:
     """Run the loop of a hand until the node is shut down."""
     import rclpy  # pyright: ignore[reportMissingImports]
+    from rclpy.executors import ExternalShutdownException  # pyright: ignore[reportMissingImports]
     from sensor_msgs.msg import JointState  # pyright: ignore[reportMissingImports]
     from std_msgs.msg import Bool  # pyright: ignore[reportMissingImports]
     from std_srvs.srv import SetBool  # pyright: ignore[reportMissingImports]
@@ -156,7 +158,8 @@ def main() -> None:
     gc.collect()
     gc.freeze()  # else Python looks through all that was imported in some tick
     node.create_timer(loop.period, tick)
-    rclpy.spin(node)
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
 
 
 def listen(node: Any, loop: HandLoop) -> Callable[[], None]:

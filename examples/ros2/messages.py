@@ -4,9 +4,9 @@ The classes of messages are given as `types`: those of ROS (`ros_types`), or tho
 """
 
 import array
+import functools
 import importlib
 from collections.abc import Callable, Iterable
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -57,10 +57,18 @@ class Types(Protocol):
 
 
 def ros_types() -> Types:
-    """Return the classes of a sourced ROS."""
-    classes = {name: getattr(importlib.import_module(f"{package}.msg"), name) for name, package in PACKAGES.items()}
-    types: Any = SimpleNamespace(**classes, floats=lambda numbers: array.array("d", numbers))
+    """Return the classes of a sourced ROS; each is imported when it is first used."""
+    types: Any = _Ros()
     return types
+
+
+class _Ros:
+    """The classes of messages as attributes, by name."""
+
+    floats = functools.partial(array.array, "d")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(importlib.import_module(f"{PACKAGES[name]}.msg"), name)
 
 
 def read_points(message: "ros.sensor_msgs__msg__PointCloud2") -> np.ndarray:

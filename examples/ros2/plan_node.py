@@ -4,6 +4,7 @@
 `plan` holds what the node does with messages; it needs no ROS. `torchgrasp_ros/action/PlanGrasp.action` has the fields.
 """
 
+import contextlib
 import functools
 import json
 import math
@@ -91,7 +92,7 @@ def main() -> None:
     from rclpy.action import ActionServer, CancelResponse  # pyright: ignore[reportMissingImports]
     from rclpy.callback_groups import ReentrantCallbackGroup  # pyright: ignore[reportMissingImports]
     from rclpy.duration import Duration  # pyright: ignore[reportMissingImports]
-    from rclpy.executors import MultiThreadedExecutor  # pyright: ignore[reportMissingImports]
+    from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor  # pyright: ignore[reportMissingImports]
     from torchgrasp_ros.action import PlanGrasp  # pyright: ignore[reportMissingImports]
 
     rclpy.init()
@@ -134,7 +135,8 @@ def main() -> None:
         node, PlanGrasp, "plan_grasp", execute,
         callback_group=ReentrantCallbackGroup(), cancel_callback=lambda _: CancelResponse.ACCEPT,
     )  # fmt: skip
-    rclpy.spin(node, MultiThreadedExecutor())
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node, MultiThreadedExecutor())
 
 
 if __name__ == "__main__":

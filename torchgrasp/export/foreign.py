@@ -1,10 +1,6 @@
 """Import of grasps from other planners and from our own JSON, as `Grasps`.
 
-DexGraspBench's .npy is a pickle, which could run code when it is read, so it is rejected. Convert a file that you
-trust:
-
-    content = numpy.load("0.npy", allow_pickle=1).item()
-    numpy.savez("0.npz", grasp_qpos=content["grasp_qpos"], pregrasp_qpos=content["pregrasp_qpos"])
+DexGraspBench's .npy is a pickle, which could run code when it is read, so it is rejected; docs/exchange.md converts one.
 """
 
 import functools

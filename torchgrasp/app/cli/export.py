@@ -73,16 +73,15 @@ class Export(Command):
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return the exit code."""
         named = self.format in ("dexgraspbench", "graspgen", "glb")
-        if (self.object is None) == named and self.format != "moveit":
-            wanted = "a path with --format dexgraspbench, graspgen or glb, or an id with moveit, and with these alone"
-            raise BadArgument("--object", self.object, wanted)
+        if named and self.object is None:
+            raise BadArgument("--object", None, f"a path with --format {self.format}")
         with naming(path="--flange"):
             flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
         robot = {"rename": read_names(self.rename), "flange": flange, "object_id": None if named else self.object}
         robot = {name: x for name, x in robot.items() if x is not None}
         taken = inspect.signature(TEXTS[self.format]).parameters if self.format in TEXTS else ()
         if unused := [name for name in robot if name not in taken]:
-            raise BadArgument(f"--{unused[0]}", f"--format {self.format}", "a format that it is for")
+            raise BadArgument(unused[0], f"--format {self.format}", "a format that it is for")
         with naming(path="GRASPS"):
             planned = load_grasps(self.grasps)
         hand = hand_of(planned, self.hand)
