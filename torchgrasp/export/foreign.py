@@ -1,6 +1,6 @@
 """Import of grasps from other planners and from our own JSON, as `Grasps`.
 
-DexGraspBench's .npy is a pickle, which could run code when it is read, so it is rejected; docs/exchange.md converts one.
+DexGraspBench's .npy is a pickle, which could run code when it is read, so it is rejected. docs/exchange.md converts it.
 """
 
 import functools
