@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.cloud.tables import read_table
+from torchgrasp.cloud.columns import find_columns, read_fields
+from torchgrasp.files import Malformed, explain
 from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.lazy import trimesh
 from torchgrasp.limits import CLOUD_POINTS, TEXT_MESH_BYTES
@@ -15,13 +16,14 @@ TYPES = {
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
 """NumPy's types by the old and new names of the PLY format."""
+Property = tuple[str, str, str]  # name, type, and type of the length if it is a list
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
     """Return points, normals, viewpoint, frustum and table of a PLY file by name; entries that it lacks are None."""
     header, body = _split_header(data)
     encoding, viewpoint, frustum, table = "", None, None, None
-    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    elements: list[tuple[str, int, list[Property]]] = []
     for line in header:
         match line.split():
             case ["format", kind, "1.0"]:
@@ -34,30 +36,28 @@ def parse_ply(data: bytes) -> dict[str, Any]:
                 table = np.array([float(x) for x in numbers])
             case ["element", name, count]:
                 elements.append((name, int(count), []))
-            case ["property", "list", _, _, name] if elements:
-                elements[-1][2].append((name, "list"))
+            case ["property", "list", length, kind, name] if elements and {length, kind} <= TYPES.keys():
+                elements[-1][2].append((name, TYPES[kind], TYPES[length]))
             case ["property", kind, name] if elements and kind in TYPES:
-                elements[-1][2].append((name, TYPES[kind]))
+                elements[-1][2].append((name, TYPES[kind], ""))
             case ["property" | "element" | "format", *_]:
-                raise ValueError(f"the header line {line!r}")
+                raise Malformed(f"the header line {line!r}")
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        raise ValueError(f"the encoding {encoding!r}")
+        raise Malformed(f"the encoding {encoding!r}")
     # Before the body is parsed: a mesh has twice as many faces as corners.
     if any(not 0 <= count <= 2 * CLOUD_POINTS for _, count, _ in elements):
-        raise ValueError(f"elements {[(name, count) for name, count, _ in elements]}; at most {CLOUD_POINTS} points")
+        raise Malformed(f"elements {[(name, count) for name, count, _ in elements]}; at most {CLOUD_POINTS} points")
     faces = sum(count for name, count, _ in elements if name == "face")
     if faces:
         if encoding == "ascii" and len(body) > TEXT_MESH_BYTES:
-            raise ValueError(f"a mesh of {len(body)} bytes of text, which may have {TEXT_MESH_BYTES}")
+            raise Malformed(f"a mesh of {len(body)} bytes of text, which may have {TEXT_MESH_BYTES}")
         points, normals = _sample_mesh(data)
         return {"points": points, "normals": normals, "viewpoint": viewpoint}
-    if not elements or elements[0][0] != "vertex" or any(kind == "list" for _, kind in elements[0][2]):
-        raise ValueError("a first element that is not a plain vertex")
+    if not elements or elements[0][0] != "vertex":
+        raise Malformed("a first element that is not called vertex")
     _, count, properties = elements[0]
-    columns = _read_columns(body, encoding, count, properties)
-    points = np.stack([columns[name] for name in "xyz"], axis=-1)
-    normals = np.stack([columns[f"n{axis}"] for axis in "xyz"], axis=-1) if "nx" in columns else None
-    return {"points": points, "normals": normals, "viewpoint": viewpoint, "frustum": frustum, "table": table}
+    found = _read_columns(body, encoding, count, properties, not any(more for _, more, _ in elements[1:]))
+    return {**found, "viewpoint": viewpoint, "frustum": frustum, "table": table}
 
 
 def format_ply(
@@ -82,24 +82,27 @@ def format_ply(
 def _split_header(data: bytes) -> tuple[list[str], bytes]:
     """Return the lines of a PLY file's header, and the data after the header."""
     end = data.find(b"end_header", 0, 65536)
-    stop = data.find(b"\n", end) + 1
+    stop = data.find(b"\n" if b"\n" in data[: max(end, 0)] else b"\r", end) + 1
     if not data.startswith(b"ply") or end < 0 or stop == 0:
-        raise ValueError("no PLY header")
+        raise Malformed("no PLY header")
     return data[:end].decode("ascii").splitlines()[1:], data[stop:]
 
 
-def _read_columns(body: bytes, encoding: str, count: int, properties: list[tuple[str, str]]) -> dict[str, np.ndarray]:
-    """Return the numbers of each property of the vertices, by the name of the property."""
-    names = [name for name, _ in properties]
-    if len(set(names)) != len(names) or not 0 <= count <= CLOUD_POINTS:
-        raise ValueError(f"the properties {names} of {count} vertices")
-    if encoding == "ascii":
-        table = read_table(body, count, len(names))
-        return {name: table[:, i] for i, name in enumerate(names)}
-    order = "<" if encoding == "binary_little_endian" else ">"
-    dtype = np.dtype([(name, order + kind) for name, kind in properties])
-    table = np.frombuffer(body, dtype=dtype, count=count)
-    return {name: table[name] for name in names}
+def _read_columns(body: bytes, encoding: str, count: int, properties: list[Property], last: bool) -> dict[str, Any]:
+    """Return points and normals of the vertices; their lists must be as long as those of the first vertex."""
+    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
+    names, fields, lengths = list[str](), list[tuple[str, int]](), dict[int, int]()
+    for name, kind, counter in properties:
+        if counter:
+            names, fields = [*names, "_"], [*fields, (counter, 1)]
+            lengths[len(fields)] = int(read_fields(body, fields, min(count, 1), order, False)[-1][0, 0])
+        fields.append((kind, lengths.get(len(fields), 1)))
+        names.append(f"list {name}" if counter else name)
+    columns = read_fields(body, fields, count, order, last)
+    for i, length in lengths.items():
+        if (columns[i - 1] != length).any():
+            raise Malformed(f"a {names[i]} of different lengths")
+    return find_columns(names, columns)
 
 
 def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
@@ -107,9 +110,9 @@ def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         mesh = load_triangles(data, ".ply", process=False)
     except Exception as error:  # the parser raises whatever the bytes provoke
-        raise ValueError(f"a mesh that cannot be parsed ({error})") from error
+        raise Malformed(f"a mesh with {explain(error)}") from error
     if not isinstance(mesh, trimesh.Trimesh) or not mesh.area > 0 or not np.isfinite(mesh.vertices).all():
-        raise ValueError("a mesh without a surface")
+        raise Malformed("a mesh without a surface")
     points, faces = trimesh.sample.sample_surface(mesh, 2000, seed=0)[:2]
     mesh.merge_vertices()
     return np.asarray(points), np.asarray(mesh.face_normals[faces]) if mesh.is_volume else None

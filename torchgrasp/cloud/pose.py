@@ -10,8 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import RIGID, check_tensor, is_rigid
-from torchgrasp.cloud.tables import parse_npy, read_lines, read_suffixed
+from torchgrasp.cloud.columns import read_lines
+from torchgrasp.cloud.tables import parse_npy, read_suffixed
 from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.files import explain
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support, find_table
@@ -72,7 +74,7 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
         table = parse_npy(data) if suffix == ".npy" else read_lines(data)
         pose = torch.from_numpy(np.array(table, dtype=np.float64))
     except Exception as error:
-        raise BadArgument(name, f"{path}: {error!r}", f"a well-formed {suffix} file of 4 x 4 numbers") from error
+        raise BadArgument(name, f"{path}: {explain(error)}", f"a well-formed {suffix} file of 4 x 4 numbers") from error
     return check_rigid(name, pose)
 
 

@@ -14,16 +14,19 @@ from torch import Tensor
 from torchgrasp.base import Value, named_tensors
 from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
+from torchgrasp.cloud.columns import find_columns, parse_text
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
-from torchgrasp.cloud.tables import parse_npy, parse_npz, read_lines
+from torchgrasp.cloud.tables import parse_npy, parse_npz
 from torchgrasp.cloud.viewpoint import can_see
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
-from torchgrasp.files import read_bounded, write_file
+from torchgrasp.files import explain, read_bounded, write_file
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 from torchgrasp.values import PointCloud
+
+TEXTS = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb")  # tables of numbers
 
 
 @checked
@@ -56,7 +59,9 @@ def read_cloud(
       Its default `0 0 0 1 0 0 0` counts only if the points look like those of a camera in the origin.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4, 3), `table` (4,);
       for several views, `viewpoint` (n, 3) and `frustum` (n, 4, 3).
-    * `.npy`, `.xyz`, `.txt`, `.csv` (text): an (n, 3) array, or (n, 6) with normals; colours are left out.
+    * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out.
+    * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first line may name the
+      columns, as in x y z nx ny nz, or count the rows.
 
     Images (h, w, 3) of points are accepted. Rows with NaN or infinity are left out; so are zero rows, if several.
 
@@ -102,15 +107,15 @@ def read_cloud_file(
         ".pcd": parse_pcd,
         ".npz": lambda data: parse_npz(data, ("points", "normals", "viewpoint", "frustum", "table"), "points"),
         ".npy": lambda data: {"columns": parse_npy(data)},
-        **dict.fromkeys((".xyz", ".txt", ".csv"), lambda data: {"columns": read_lines(data)}),
+        **dict.fromkeys(TEXTS, lambda data: parse_text(data, suffix)),
     }
     if suffix not in parsers:
-        raise CloudFileError("path", path, "a file ending in .ply, .pcd, .npz, .npy, .xyz, .txt or .csv")
+        raise CloudFileError("path", path, f"a file ending in .ply, .pcd, .npz, .npy, {', '.join(TEXTS)}")
     data = read_bounded(path, CLOUD_BYTES, f"a {suffix} file", functools.partial(CloudFileError, "path"))
     try:
         arrays = parsers[suffix](data)
     except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
-        raise CloudFileError("path", f"{path}: {error!r}", f"a well-formed {suffix} file") from error
+        raise CloudFileError("path", f"{path}: {explain(error)}", f"a well-formed {suffix} file") from error
     return make_cloud(str(path), arrays, position, {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit])
 
 
@@ -157,6 +162,8 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
     notes: list[str] = []
     if "columns" in arrays:
         arrays = _split_columns(source, arrays, notes)
+    if arrays.get("other"):
+        notes.append(f"columns {', '.join(arrays['other'])[:200]} were left out")
     points = scale * _as_rows(source, "points", arrays["points"])
     normals = None if arrays.get("normals") is None else _as_rows(source, "normals", arrays["normals"])
     default = bool(arrays.get("default")) and viewpoint is None
@@ -207,7 +214,7 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{source}: {name} of type {array.dtype}", "real numbers")
     if array.ndim not in ((1, 2, 3) if name == "viewpoint" else (2, 3)) or array.shape[-1] != 3:
-        allowed = "an array of shape (n, 3), or (h, w, 3) of an image"
+        allowed = "an array of shape (n, 3), or (h, w, 3) of an image, or (3,) of one viewpoint"
         raise CloudFileError("path", f"{source}: {name} of shape {array.shape}", allowed)
     if array.size > 3 * CLOUD_POINTS:
         raise CloudFileError("path", f"{source} with {array.size // 3} points", f"at most {CLOUD_POINTS} points")
@@ -220,6 +227,8 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
 def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dict[str, Any]:
     """Return arrays in which the table of 3 or 6 columns is split into points and normals; colours are left out."""
     table = np.asarray(arrays["columns"])
+    if names := table.dtype.names:
+        return find_columns(names, [table[name] for name in names])
     if table.ndim not in (2, 3) or table.shape[-1] not in (3, 6) or table.dtype.kind not in "fiu":
         found = f"{source}: an array of shape {table.shape} and type {table.dtype}"
         allowed = "real numbers of shape (n, 3) or (n, 6), or (h, w, 3) or (h, w, 6) of an image"

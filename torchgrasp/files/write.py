@@ -59,6 +59,15 @@ def remove_file(path: Path) -> None:
         raise OutputError("path", f"{path} ({error.strerror or error})", "a file that can be removed") from error
 
 
+class Malformed(ValueError):
+    """What is wrong with a file's content, as a sentence of ours."""
+
+
+def explain(error: Exception) -> str:
+    """Return what is wrong with a file that a parser failed on; sentences of other libraries are left out."""
+    return str(error) if isinstance(error, Malformed) else "a content that is broken or cut off"
+
+
 def is_file(path: Path | str) -> bool:
     """Return whether a path is a regular file; False for a path of a wrong type or length."""
     try:
@@ -77,9 +86,12 @@ def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> b
     """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for other files."""
     check_file(path, most, allowed, refuse)
     try:
-        return read_bytes(path)
+        data = read_bytes(path)
     except OSError as error:
         raise refuse(f"{path}: {error}", allowed) from error
+    if data.startswith(b"version https://git-lfs."):
+        raise refuse(f"{path}, a pointer of Git LFS", f"{allowed}: git lfs pull")
+    return data
 
 
 def check_file(path: Path | str, most: int, allowed: str, refuse: Refuse) -> None:

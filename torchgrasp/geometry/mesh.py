@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchgrasp.errors import MeshError, SuspiciousScale
-from torchgrasp.files import is_file, read_bytes
+from torchgrasp.files import Malformed, explain, is_file, read_bytes
 from torchgrasp.lazy import trimesh
 from torchgrasp.limits import MAX_EXTENT, MESH_BYTES, MESH_FACES, MIN_EXTENT, PLY_HEADER_BYTES, PLY_PROPERTIES
 
@@ -40,7 +40,7 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
         try:
             loaded = load_triangles(read_bytes(path), path.suffix.lower())
         except Exception as error:  # the readers of trimesh raise whatever their format runs into
-            raise MeshError("mesh", f"{path}: {error}", MESH_FILE) from error
+            raise MeshError("mesh", f"{path}: {explain(error)}", MESH_FILE) from error
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
             raise MeshError("mesh", f"{path}, which holds no faces", "a closed triangle mesh")
         mesh = loaded
@@ -134,7 +134,7 @@ def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
     """Return what `trimesh.load_mesh` reads from bytes; bad bytes and too many faces may raise any exception."""
     data = _geometry(data) if suffix == ".obj" else data
     if (faces := _count_faces(data, suffix)) > MESH_FACES:
-        raise ValueError(f"a mesh of {faces} faces; at most {MESH_FACES}")
+        raise Malformed(f"a mesh of {faces} faces; at most {MESH_FACES}")
     # from memory and without a resolver: materials and textures beside it stay closed
     with _quiet(trimesh.util.log):
         return trimesh.load_mesh(io.BytesIO(data), file_type=suffix[1:], skip_materials=True, **options)
@@ -176,9 +176,9 @@ def _read_header(data: bytes) -> int:
         if words and b"element" in words[0] and words[1:2] == [b"face"]:
             faces += int(words[-1])
     else:
-        raise ValueError(f"a header without an end in {PLY_HEADER_BYTES} bytes")
+        raise Malformed(f"a header without an end in {PLY_HEADER_BYTES} bytes")
     if properties > PLY_PROPERTIES:
-        raise ValueError(f"a header of {properties} properties; at most {PLY_PROPERTIES}")
+        raise Malformed(f"a header of {properties} properties; at most {PLY_PROPERTIES}")
     return faces
 
 

@@ -18,7 +18,7 @@ from torchgrasp.cloud.depth import Array, frustum_of_image, read_depth
 from torchgrasp.cloud.pose import read_camera_pose
 from torchgrasp.cloud.tables import parse_npz
 from torchgrasp.errors import BadArgument, CloudFileError
-from torchgrasp.files import read_bounded
+from torchgrasp.files import explain, read_bounded
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import GRID
@@ -153,7 +153,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     except BadArgument:
         raise
     except Exception as error:  # zlib, zipfile and numpy each raise their own
-        raise CloudFileError("path", f"{path}: {error!r}", allowed) from error
+        raise CloudFileError("path", f"{path}: {explain(error)}", allowed) from error
     return found
 
 

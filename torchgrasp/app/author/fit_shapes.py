@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from torchgrasp.app.author.repair import place, pose_of
 from torchgrasp.errors import HandFileError
-from torchgrasp.files import read_bounded
+from torchgrasp.files import explain, read_bounded
 from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.urdf import Shape, Urdf
@@ -107,7 +107,7 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     try:
         mesh = load_triangles(data, path.suffix.lower(), process=False)
     except Exception as error:  # the readers of trimesh raise errors of many kinds
-        raise urdf.wrong(f"mesh {name!r}: {error}"[:300], allowed) from error
+        raise urdf.wrong(f"mesh {name!r}: {explain(error)}", allowed) from error
     sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MESH_FACES
     if not sound or not np.isfinite(mesh.vertices).all():
         raise urdf.wrong(f"mesh {name!r} without faces, or with vertices that are not finite", allowed)

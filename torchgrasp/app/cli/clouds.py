@@ -63,7 +63,7 @@ def _no_view(cloud: PointCloud) -> BadArgument | None:
 class CloudCut(Command):
     """Write the points of one object in a scene, without the points of the table, and the plane of the table."""
 
-    cloud: Path = positional("point cloud of a scene of any size (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv)")
+    cloud: Path = positional("point cloud of a scene of any size (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)")
     out: Path = required(inputs.OUT_CLOUD_HELP)
     view: inputs.ViewOptions = nested(inputs.ViewOptions())
     point: tuple[float, float, float] | None = option(

@@ -32,7 +32,7 @@ from torchgrasp.specs import Simulator
 from torchgrasp.values import PointCloud
 
 MOST_POINTS = 100_000  # most points of a file that are used; a shape is fitted to fewer
-CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, .xyz, .txt, .csv)"
+CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)"
 OUT_CLOUD_HELP = "point cloud to write (.npz or .ply), in metres"
 HAND_HELP = "name of a shipped hand (allegro, barrett, leap, shadow), or the folder of another hand"
 FINGERS_HELP = "fingers that grasp: an option of the hand, a number of fingers, or names as in index,middle,thumb"

@@ -1,0 +1,153 @@
+"""Tables of points, as text or binary rows, and the meaning of their columns by name."""
+
+import io
+import itertools
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from torchgrasp.files import Malformed
+from torchgrasp.limits import CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMNS
+
+
+def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, Any]:
+    """Return `points` (n, 3), their `normals` or None, and the `other` names, of columns by name.
+
+    Names are x, y, z, nx, ny, nz in any case, or as in normal_x. Of a column (n, k) the first number counts.
+    """
+    places, other = dict[str, int](), list[str]()
+    for i, name in enumerate(names):
+        meant = re.fullmatch(r"(?:(n)(?:ormal)?_?)?([xyz])", name.lower())
+        axis = "".join(meant.groups("")) if meant else ""
+        if axis in places:
+            raise Malformed(f"two columns {name}")
+        if axis:
+            places[axis] = i
+        elif name != "_":  # the padding of PCD
+            other.append(name)
+    axes = ["x", "y", "z"] + ["nx", "ny", "nz"] * (not places.keys() <= {*"xyz"})
+    if missing := [axis for axis in axes if axis not in places]:
+        raise Malformed(f"columns {' '.join(names)[:200]!r} without {', '.join(missing)}")
+    found = np.stack([columns[places[axis]].reshape(len(columns[0]), -1)[:, 0] for axis in axes], -1)
+    return {"points": found[:, :3], "normals": found[:, 3:] if len(axes) > 3 else None, "other": other}
+
+
+def read_fields(
+    data: bytes, fields: Sequence[tuple[str, int]], count: int, order: str = "", last: bool = True
+) -> list[np.ndarray]:
+    """Return the numbers (count, n) of each field, given its type and n. Without an `order` of bytes, data are text.
+
+    Little memory beyond the numbers is used. Raises `Malformed` for too little data, or a longer row or another row
+    where nothing should follow the `last` row.
+    """
+    if not 0 <= count <= CLOUD_POINTS:
+        raise Malformed(f"{count} points, not up to {CLOUD_POINTS}")
+    sizes = [n for _, n in fields]
+    wanted = count * sum(sizes)
+    if order:
+        dtype = np.dtype([(str(i), order + kind, (n,)) for i, (kind, n) in enumerate(fields)])  # names may be alike
+        if not 0 <= len(data) - count * dtype.itemsize < (dtype.itemsize if last else len(data) + 1):
+            raise Malformed(f"{len(data)} bytes of points, where the header promises {count * dtype.itemsize}")
+        rows = np.frombuffer(data, dtype=dtype, count=count)
+        return [rows[str(i)] for i in range(len(fields))]
+    first = next(iter(data[:LINE_LETTERS].lstrip().splitlines()), b"").split()
+    if last and wanted and len(first) != sum(sizes):
+        raise Malformed(f"{len(first)} numbers in the first row, where the header promises {sum(sizes)}")
+    numbers = np.zeros(0)
+    if 0 < 2 * wanted <= len(data) + 1:  # a number has at least a digit and a space
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # at a word that is no number; the count shows it
+            numbers = np.fromstring(data, dtype=np.float64, count=wanted, sep=" ")
+    if len(numbers) < wanted:
+        raise Malformed(f"fewer numbers than {count} points have, or a word that is no number")
+    return np.split(numbers.reshape(count, sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
+
+
+def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
+    """Return a text's columns by the names in its first line, or `columns` if there are three or six without names.
+
+    A first line of one number counts the rows. In `.xyzi` and `.pts` files an intensity may follow x, y and z.
+    """
+    names, table = _read_text(data)
+    rows, width = table.shape
+    if len(names) == 1 and names[0].isdecimal():
+        if int(names[0]) != rows:
+            raise Malformed(f"{rows} rows, where the first line promises {names[0]}")
+        names = []
+    if not names and suffix in (".xyzi", ".pts") and width in (4, 7):
+        names = ["x", "y", "z", "intensity", "red", "green", "blue"][:width]
+    if len(names or [0] * width) != width or (not names and width not in (3, 6)):
+        named = f"the names {' '.join(names)[:200]!r}" if names else "no line of names above, such as x y z nx ny nz"
+        raise Malformed(f"{width} columns with {named}")
+    return find_columns(names, list(table.T)) if names else {"columns": table}
+
+
+def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
+    """Return a text's numbers, one row for each line; blanks, commas or semicolons separate the numbers.
+
+    `#` or `//` starts a comment. A first line of words is left out.
+    """
+    return _read_text(data)[1]
+
+
+def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
+    """Return a text's numbers, and the words of a line above them that names the columns or counts the rows."""
+    comment, shown = str(), str()
+    number = rows = width = 0
+
+    def lines() -> Iterator[str]:
+        nonlocal comment, shown, number, rows
+        stream = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig")
+        while shown := stream.readline(LINE_LETTERS + 1):
+            number += 1
+            if len(shown) > LINE_LETTERS:
+                raise Malformed(f"a line of more than {LINE_LETTERS} characters")
+            if number > 2 * CLOUD_POINTS:
+                raise Malformed(f"more than {2 * CLOUD_POINTS} lines")
+            line, _, said = shown.replace("//", "#").partition("#")
+            comment = comment if rows or not said else said
+            if line.isspace() or not line:
+                continue
+            rows += 1
+            if rows > CLOUD_POINTS:
+                raise Malformed(f"more than {CLOUD_POINTS} lines of numbers")
+            if rows <= 2:  # the other lines have as many numbers, or are refused
+                _check_line(line.strip())
+            yield line.replace(",", " ").replace(";", " ").replace('"', " ")
+
+    every, names = lines(), list[str]()
+    try:
+        some = [next(every, "")]
+        if some[0].strip().isdecimal():  # a count of the rows, if the next line has more numbers
+            some.append(next(every, ""))
+        width = len(some[-1].split())
+        if not re.search(r"(?i)(?:^|\s)[-+.]*(?:\d|(?:nan|inf)\b)", some[0]) or len(some[0].split()) < width:
+            names = some.pop(0).split()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without numbers, which is refused below
+            table = np.loadtxt(itertools.chain(filter(None, some), every), ndmin=2)
+    except Malformed:
+        raise
+    except UnicodeDecodeError as error:
+        raise Malformed("text of another encoding than UTF-8") from error
+    except ValueError as error:
+        raise Malformed(f"line {number}, {shown.strip()[:60]!r}, where {width} numbers should be") from error
+    if not table.size:
+        raise Malformed("no numbers")
+    words = comment.replace(",", " ").split()
+    return words if not names and {"x", "y", "z"} <= {*map(str.lower, words)} else names, table
+
+
+def _check_line(line: str) -> None:
+    """Raise `Malformed` for a line of too many numbers, with decimal commas, as in 0,03;0,1, or with an empty cell."""
+    if len(re.split(r"[\s,;]+", line)) > TEXT_COLUMNS:
+        raise Malformed(f"more than {TEXT_COLUMNS} numbers in a line")
+    mixed = re.search(r"\d,\d", line) and re.search(r'[;"]|[^\s,]\s+[^\s,]', line)
+    if mixed or re.search(r"(?:^|,)-?0\d", line):
+        raise Malformed(f"decimal commas: {line[:60]!r}")
+    if re.search(r"[,;]\s*[,;]", line):
+        raise Malformed(f"an empty cell: {line[:60]!r}")
