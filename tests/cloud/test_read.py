@@ -8,9 +8,9 @@ import pytest
 import torch
 import trimesh
 
+from torchgrasp.cloud.columns import read_lines
 from torchgrasp.cloud.pcd import decompress
 from torchgrasp.cloud.read import cloud_from_array, read_cloud, read_cloud_file, save_cloud
-from torchgrasp.cloud.columns import read_lines
 from torchgrasp.errors import BadArgument, CloudFileError, GraspError, OutputError, SuspiciousScale, TooFewPoints
 from torchgrasp.values import PointCloud
 

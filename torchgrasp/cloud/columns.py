@@ -96,7 +96,7 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
 
 def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
     """Return a text's numbers, and the words of a line above them that names the columns or counts the rows."""
-    comment, shown = str(), str()
+    comment = shown = ""
     number = rows = width = 0
 
     def lines() -> Iterator[str]:
@@ -138,7 +138,7 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
         raise Malformed(f"line {number}, {shown.strip()[:60]!r}, where {width} numbers should be") from error
     if not table.size:
         raise Malformed("no numbers")
-    words = comment.replace(",", " ").split()
+    words: list[str] = comment.replace(",", " ").split()
     return words if not names and {"x", "y", "z"} <= {*map(str.lower, words)} else names, table
 
 
