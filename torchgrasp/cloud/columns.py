@@ -96,7 +96,8 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
 
 def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
     """Return a text's numbers, and the words of a line above them that names the columns or counts the rows."""
-    comment = shown = ""
+    comment: str = ""
+    shown: str = ""
     number = rows = width = 0
 
     def lines() -> Iterator[str]:
@@ -138,7 +139,7 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
         raise Malformed(f"line {number}, {shown.strip()[:60]!r}, where {width} numbers should be") from error
     if not table.size:
         raise Malformed("no numbers")
-    words: list[str] = comment.replace(",", " ").split()
+    words = comment.replace(",", " ").split()
     return words if not names and {"x", "y", "z"} <= {*map(str.lower, words)} else names, table
 
 
