@@ -139,7 +139,7 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
         raise Malformed(f"line {number}, {shown.strip()[:60]!r}, where {width} numbers should be") from error
     if not table.size:
         raise Malformed("no numbers")
-    words = comment.replace(",", " ").split()
+    words = [*comment.replace(",", " ").split()]  # also a comment may name the columns
     return words if not names and {"x", "y", "z"} <= {*map(str.lower, words)} else names, table
 
 
