@@ -43,6 +43,7 @@ class Authored(TrialRun):
         zero = torch.zeros(3, 3, dtype=torch.float64)
         self.robot = SimpleNamespace(
             period=1 / self.spec.control_rate, truth=TipContact(zero[0], zero, zero, zero, zero[0]), steps=0,
+            sent=np.zeros(4),
             first_touch=[1.0 if touched else math.inf] * 3, unbalanced=lambda: 0.0, finger=np.zeros(3, dtype=bool),
         )  # fmt: skip
         self.robot.ticks = lambda seconds: max(1, round(seconds / self.robot.period))

@@ -45,6 +45,7 @@ def closing(run):
         object_pose=lifted,
         hand_pose=run.closure.hand_pose[:1].double() @ lifted,
         joints=run.closure.joints[:1].expand(TICKS, -1).clone(),
+        targets=run.closure.targets[:1].expand(TICKS, -1).clone(),
         contact_order=(0, 2, 1),
         trace=trace,
         phases=torch.tensor([0.1, 0.4, 0.5], dtype=F64),
@@ -178,7 +179,8 @@ def test_a_closing_without_the_law_has_no_panel_of_lambda(run, closing):
 
 
 def test_trials_that_ended_at_once_or_diverged_have_a_film(run, closing):
-    first = {name: getattr(closing, name)[:1] for name in ("time", "forces", "object_pose", "hand_pose", "joints")}
+    names = ("time", "forces", "object_pose", "hand_pose", "joints", "targets")
+    first = {name: getattr(closing, name)[:1] for name in names}
     trace = ClosingTrace(*(getattr(closing.trace, f.name)[:1] for f in dataclasses.fields(ClosingTrace)))
     none = torch.full((3,), math.nan, dtype=F64)
     stuck = lost(closing, Status.START_OVERLAP, **first, trace=trace, phases=none, contact_order=())

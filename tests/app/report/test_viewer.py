@@ -122,7 +122,9 @@ def test_sensors_and_the_frame_of_the_file_are_where_the_cloud_says(run):
 def test_a_long_run_is_thinned_to_what_a_page_holds(run):
     ticks = 1000
     rows = torch.arange(ticks) % len(run.closure.time)
-    long = {name: getattr(run.closure, name)[rows] for name in ("forces", "object_pose", "hand_pose", "joints")}
+    long = {
+        name: getattr(run.closure, name)[rows] for name in ("forces", "object_pose", "hand_pose", "joints", "targets")
+    }
     trace = ClosingTrace(*(getattr(run.closure.trace, f.name)[rows] for f in dataclasses.fields(ClosingTrace)))
     closure = dataclasses.replace(run.closure, time=torch.arange(ticks).double(), trace=trace, **long)
     many = run.grasps[torch.zeros(50, dtype=torch.int64)]

@@ -114,7 +114,7 @@ def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     monkeypatch.setattr("torchgrasp.campaign.run.run_job", work)
     monkeypatch.setattr(evaluate_command, "import_simulator", lambda name: None)
     words = ["campaign", str(folder), "--hand", "barrett", "--jobs-in-shard", "2", "--workers", "0"]
-    return lambda out: [*words, "--out", str(out / "campaign")]
+    return lambda out: [*words, "--out", str(out / "campaign"), "--parquet", str(out / "campaign" / "parquet")]
 
 
 COMMANDS = {"sample": sample, "train": train, "grasp": grasp, "evaluate": evaluate, "campaign": gather}

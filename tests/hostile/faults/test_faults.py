@@ -25,7 +25,7 @@ from torchgrasp.files import hold_file, hold_folder
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows forks no processes")
 
-REFUSED = re.compile(r"torchgrasp: --(out|checkpoint): .*(No space left|Read-only).*\n")
+REFUSED = re.compile(r"torchgrasp: --(out|checkpoint|parquet): .*(No space left|Read-only).*\n")
 """What is said where the disk refuses."""
 
 HELD = {"sample": "samples", "grasp": "grasps", "evaluate": "evaluation", "campaign": "campaign"}
