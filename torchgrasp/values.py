@@ -216,7 +216,8 @@ class Grasps(Batch):
     and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle between pad axis and contact
     direction. `score` is the log-odds of the predicted success, which ranks the grasps; `interval` bounds the share of
     such grasps that held in trials (95 % over families). `known` tells for which grasps trials support the prediction;
-    None means for all. `meta` holds names, units, hashes and the seed as text.
+    None means for all. `meta` holds names, units, hashes and the seed as text. With an arm, `arm` are its joints [rad],
+    and `ease` its least joint margin and manipulability on the way (`torchgrasp.arm.ArmPath`).
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
@@ -239,6 +240,8 @@ class Grasps(Batch):
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
     known: Bool[Tensor, "g"] | None = None
     interval: Annotated[Float[Tensor, "g 2"], ANY] | None = None
+    arm: Float[Tensor, "g n"] | None = None
+    ease: Float[Tensor, "g 2"] | None = None
 
     @property
     def success(self) -> Float[Tensor, "g"]:

@@ -61,14 +61,14 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
         cell = palm_cell if finger == -1 else finger_cell
         for shape in link.shapes:
             # a tip's contact is known exactly: no sphere may touch before it
-            centers, radius = _cover(shape, cell, 0.0 if touching else bulge)
+            centers, radius = cover(shape, cell, 0.0 if touching else bulge)
             rows += [(index, center, radius, finger, touching) for center in centers]
     link_index, center, radius, finger, touching = zip(*rows, strict=True)
     link_index, finger, touching = (torch.tensor(x, device="cpu") for x in (link_index, finger, touching))
     return CollisionSpheres(link_index, real(center), real(radius), finger, touching)
 
 
-def _cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
+def cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
     """Return the centres and the radius [m] of spheres that cover a shape, one for each cell of about size `cell`."""
     single_layer = 0.025  # a shape thinner than this [m] has one layer of cells across
     if shape.kind == "sphere":

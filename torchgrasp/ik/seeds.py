@@ -151,7 +151,11 @@ def nearest_postures(
             b = at.repeat_interleave(n_seeds)  # one row for each seed
         else:
             best = cost.topk(min(3 * n_seeds, candidates), 1, largest=False).indices
-            reached = ask_reachable(reachable, obj_from_hand[at, best].flatten(0, 1)).reshape(best.shape)
+            reached = torch.zeros_like(best, dtype=torch.bool)
+            for some in (slice(n_seeds), slice(n_seeds, None)):
+                short = torch.nonzero(reached.sum(1) < n_seeds)[:, 0]
+                poses = obj_from_hand[short[:, None], best[short, some]]
+                reached[short, some] = ask_reachable(reachable, poses.flatten(0, 1)).reshape(poses.shape[:2])
             kept = reached & (reached.cumsum(1) <= n_seeds)
             b, best = at.expand_as(best)[kept], best[kept]
         order, sample = order[b, best], sample[b, best]

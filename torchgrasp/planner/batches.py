@@ -173,6 +173,7 @@ class Planner:
         if not parts:
             return ranked
         grasps, owner = join_owned(parts)
+        grasps = self.stack.first.on_arm(grasps)
         clouds = zip(ranked, by_cloud(owner, len(self.stack)), strict=True)
         return [join([found, grasps[own].to(found.joints.device)]) for found, own in clouds]
 
@@ -215,6 +216,7 @@ def rank(stack: Stack, solved: Owned) -> list[Grasps]:
     if problem.buried:
         buried = torch.where(grasps.status == Status.OK, int(Status.BURIED), grasps.status)
         grasps = dataclasses.replace(grasps, status=buried)
+    grasps = problem.on_arm(grasps)
     rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
     good, body = grasps[rows], stack.body.rows(solved.owner[rows])
     features = measure_grasps(hand, body, good, spec.friction, task, task.lifts(spec.plane))

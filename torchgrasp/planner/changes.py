@@ -138,6 +138,8 @@ def _surroundings(request: Request) -> Iterator[Change]:
         lowest = float(cloud.points[:, 2].min())
         words = f"if it stood on a table at z = {lowest:.3f} m, its lowest point"
         yield Change(words, False, UNKNOWN, _with(request, table=lowest), refit=True)
-    if request.reachable is not None:
+    if request.reachable is not None or request.arm is not None:
         cures = frozenset({Status.UNREACHABLE, Status.OUT_OF_REACH})
-        yield Change("if the arm reached every pose", False, cures, dataclasses.replace(request, reachable=None))
+        yield Change(
+            "if the arm reached every pose", False, cures, dataclasses.replace(request, reachable=None, arm=None)
+        )

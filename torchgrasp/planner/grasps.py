@@ -64,6 +64,7 @@ def plan_grasps(
             `meta["promise"]` says which trials chose the bound (`torchgrasp.success.promise`).
         reachable: function that returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4) an arm reaches, in
             the frame of the cloud; by default all poses are reachable.
+        arm: the arm that carries the hand, from `load_arm`; it must reach each grasp by a straight approach, and lift.
         keep, avoid: a `Region` in which all contacts lie, and one in which none lies; or a function of points (n, 3)
             [m] that returns their signed distance [m], negative inside. Contacts lie on the estimated surface.
         mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.
@@ -77,7 +78,8 @@ def plan_grasps(
 
     Raises:
         BadArgument: an argument of the wrong type or range; a cloud of an object that is not of graspable size; a scene
-            without a target; `shape`, `observer`, `reachable`, `keep` or `avoid` beside several clouds.
+            without a target; `shape`, `observer`, `reachable`, `arm`, `keep` or `avoid` beside several
+            clouds.
         MissingExtra: pebble is not installed, for workers.
 
     The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps clear of the target's

@@ -32,7 +32,7 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
     `given` holds the other arguments of `Request`, common to all clouds. A worker process gives up a cloud after an
     hour. Where an accelerator plans clouds at once, the worker processes estimate the shapes.
     """
-    for name in ("shape", "observer", "reachable", "keep", "avoid"):
+    for name in ("shape", "observer", "reachable", "arm", "keep", "avoid"):
         if given.get(name) is not None:
             raise BadArgument(name, "one for many clouds", "None for many clouds")
     requests = [Request(cloud, **given) for cloud in clouds]

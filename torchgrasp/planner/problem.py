@@ -1,6 +1,7 @@
 """The planning problem: values derived from the arguments of `plan_grasps`, in an upright frame."""
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Iterator
 from functools import cached_property
@@ -10,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.arm.reach import reach_poses, with_arm
+from torchgrasp.base import settle
 from torchgrasp.checks import Seed, checked
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat
@@ -18,7 +21,7 @@ from torchgrasp.files import sha256
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, round_upright, upright_frame
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.candidates import Reachable
+from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
 from torchgrasp.plan.region import seen_from
@@ -180,9 +183,19 @@ class Problem:
 
     @cached_property
     def reachable(self) -> Reachable | None:
-        """The user's function that says which hand poses an arm reaches, converted to the upright frame."""
-        given, frame = self.request.reachable, self.obj_from_upright
-        return None if given is None else lambda poses: given(frame.to(poses) @ poses)
+        """The function that says which hand poses the arm and the user's function accept, in the upright frame."""
+        given, arm, frame = self.request.reachable, self.request.arm, self.obj_from_upright
+        asked = [x for x in (given, arm and functools.partial(reach_poses, arm)) if x is not None]
+        if not asked:
+            return None
+        return lambda poses: torch.stack([ask_reachable(x, frame.to(poses) @ poses) for x in asked]).all(0)
+
+    def on_arm(self, grasps: Grasps) -> Grasps:
+        """Return grasps with the postures of the arm, if there is one; those that it cannot reach have failed."""
+        if (arm := self.request.arm) is None:
+            return grasps
+        arm = settle(arm.moved(inverse(self.obj_from_upright)), self.shape.device)
+        return with_arm(arm, self.hand, grasps, self.world)
 
     def tell(self, stage: str, message: str, value: Any) -> None:
         """Report a stage to the observer, with the result of the stage in the caller's frame."""

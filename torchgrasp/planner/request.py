@@ -9,6 +9,8 @@ import typing
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypedDict, TypeVar
 
+from torchgrasp.arm.arm import Arm
+from torchgrasp.checks import Count, Range, Seed, checked
 from torchgrasp.checks import Count, Range, Seed, Taken, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
@@ -45,6 +47,7 @@ class SceneOptions(TypedDict, total=False):
     task: GraspTask | None
     promise: Promised | None
     reachable: Reachable | None
+    arm: Arm | None
     keep: Where | None
     avoid: Where | None
 
@@ -82,6 +85,7 @@ class Request:
     shape: ShapeGP | None = None
     observer: Observer | None = None
     reachable: Reachable | None = None
+    arm: Arm | None = None
     keep: Where | None = None
     avoid: Where | None = None
     time_budget: Budget | None = None

@@ -52,10 +52,14 @@ def keep_promise(grasps: Grasps, share: float) -> Grasps:
 def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
     """Sort grasps by the `groups`, in each: executable ones with a known success, other executable ones, failed ones.
 
-    Among these the score falls; the greater margin of the certificate decides between equal scores.
+    Among these the score falls; the greater margin of the certificate decides between equal scores. With an arm, grasps
+    of the same success in whole percents, as it is printed, are sorted by falling product of the numbers in `ease`.
     """
     late = 2 * (grasps.status != Status.OK).int()
     late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()
+    if grasps.ease is not None:
+        late = late.double() + (1 - torch.round(torch.sigmoid(grasps.score), decimals=2)) / 2
+        groups = *groups, late, -grasps.ease.prod(1)
     return grasps[lexical_order(*groups, late, -grasps.score, -grasps.certificate.margin)]
 
 

@@ -1,0 +1,5 @@
+"""A robot arm that carries the hand: which grasps it reaches, and its way through them (`reach`)."""
+
+from torchgrasp.arm.arm import Arm, load_arm
+
+__all__ = ["Arm", "load_arm"]

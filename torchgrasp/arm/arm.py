@@ -1,0 +1,169 @@
+"""A robot arm that carries a hand: its chain of joints, its collision spheres, and random postures to start from."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.base import Value
+from torchgrasp.checks import Pose, Seed, checked
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import apply, inverse, real
+from torchgrasp.hand.collision_shapes import ALWAYS, cover
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, tree_from_urdf
+from torchgrasp.hand.urdf import Urdf, read_published
+from torchgrasp.ik.clearance import MILLIMETRE
+from torchgrasp.ik.motion import APPROACH_DISTANCE
+
+LEVER = APPROACH_DISTANCE / MILLIMETRE  # distance [mm] that a turn by one radian counts as: the depth of a hand
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm(Value):
+    """A robot arm that carries a hand, from `load_arm`. Postures (k, n) hold n joints [rad], from the base to the tip.
+
+    `urdf` is the chain of links from base to tip. `speed` [rad/s] is the greatest of each joint. The s collision
+    spheres [m] are those of the links, then those of the hand's palm. Those of `moving` links keep clear of table and
+    objects, and the `pairs` of each other. `library` holds m random postures, with the features of their tips.
+    """
+
+    urdf: Urdf = dataclasses.field(repr=False)
+    tree: KinematicTree = dataclasses.field(repr=False)
+    lower: Float[Tensor, "n"]
+    upper: Float[Tensor, "n"]
+    speed: Float[Tensor, "n"]
+    obj_from_base: Float[Tensor, "4 4"]
+    tip_from_hand: Float[Tensor, "4 4"]
+    link: Int[Tensor, "s"]
+    center: Float[Tensor, "s 3"]
+    radius: Float[Tensor, "s"]
+    moving: Int[Tensor, "w"]
+    pairs: Int[Tensor, "p 2"]
+    library: Float[Tensor, "m n"]
+    features: Float[Tensor, "m 12"]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, from the base to the tip."""
+        return self.tree.joint_names
+
+    @checked
+    def moved(self, b_from_a: Pose) -> "Arm":
+        """Return the arm transformed from frame a to frame b."""
+        return dataclasses.replace(self, obj_from_base=b_from_a.to(self.lower) @ self.obj_from_base)
+
+    @checked
+    def hand_poses(self, joints: Float[Tensor, "k n"]) -> Float[Tensor, "k 4 4"]:
+        """Return the pose `obj_from_hand` of the hand in each posture of the arm."""
+        return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
+
+    def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> Float[Tensor, "3 4 k"]:
+        """Return the poses of the tip, in the base's frame, that put the hand at given poses."""
+        base_from_tip = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower) @ inverse(self.tip_from_hand)
+        return base_from_tip[:, :3].permute(1, 2, 0).contiguous()
+
+    def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "3 4 k"], Float[Tensor, "6 n k"]]:
+        """Return the tip's poses, and its motion by each joint: translation [mm], rotation times `LEVER`."""
+        frames = self.tree.frames(joints)
+        tip, child = frames[:, :, -1], frames.index_select(2, self.tree.child)
+        axes, slides = map_directions(child, self.tree.axis), self.tree.prismatic[:, None] > 0
+        place = torch.where(slides, axes, torch.linalg.cross(axes, tip[:, 3, None] - child[:, 3], dim=0))
+        return tip, torch.cat([place / MILLIMETRE, LEVER * torch.where(slides, 0.0, axes)])
+
+    def sphere_centres(self, joints: Float[Tensor, "n k"]) -> Float[Tensor, "3 s k"]:
+        """Return the centres [m] of all collision spheres in the object's frame."""
+        frames, pose = self.tree.frames(joints.contiguous()).index_select(2, self.link), self.obj_from_base
+        centres = map_points(frames, self.center)
+        return (pose[:3, :3] @ centres.flatten(1)).view_as(centres) + pose[:3, 3, None, None]
+
+    def overlaps(self, centres: Float[Tensor, "3 s k"]) -> Bool[Tensor, "p k"]:
+        """Return which `pairs` of spheres overlap in each posture, given the centres [m]."""
+        one, two = self.pairs.unbind(1)
+        gap = centres.index_select(1, one) - centres.index_select(1, two)
+        return (gap * gap).sum(0) < (self.radius[one] + self.radius[two]).square()[:, None]
+
+
+def features(tip: Float[Tensor, "3 4 k"]) -> Float[Tensor, "k 12"]:
+    """Return numbers of each pose whose distance is a distance [mm]; a small turn counts as its angle times `LEVER`."""
+    return torch.cat([tip[:, 3] / MILLIMETRE, LEVER / math.sqrt(2) * tip[:, :3].flatten(0, 1)]).T
+
+
+@checked
+def load_arm(
+    urdf: Path | str,
+    hand: Hand,
+    tip: str | None = None,
+    *,
+    obj_from_base: Pose | None = None,
+    tip_from_hand: Pose | None = None,
+    seed: Seed = 0,
+) -> Arm:
+    """Load a robot arm that carries a hand from the arm's URDF, for `plan_grasps`.
+
+    Args:
+        urdf: path of the file; a joint without limits gets one turn either way.
+        hand: the hand on the arm.
+        tip: the link that carries the hand; by default the one that most joints move, the last of equals.
+        obj_from_base: pose of the arm's root link in the frame of the cloud; by default the same frame.
+        tip_from_hand: pose of the hand's root link in the frame of the tip; by default the same frame.
+        seed: random seed of the postures from which inverse kinematics starts.
+
+    Raises `HandFileError` for a URDF that is missing or malformed, or has meshes on the way to the tip, and
+    `BadArgument` for a tip that is unknown, or that fewer than six joints move.
+
+    >>> from torchgrasp import load_hand
+    >>> hand = load_hand("allegro")
+    >>> load_arm(hand.urdf_path, hand, "thumb_tip")
+    Traceback (most recent call last):
+        ...
+    torchgrasp.errors.BadArgument: tip: expected a link that at least six joints move, got 'thumb_tip'
+    """
+    whole = read_published(urdf)
+    named = {link.name: link for link in whole.links}
+    tip = max(reversed(named), key=lambda name: len(whole.movers(name))) if tip is None else tip
+    if tip not in named or len(whole.movers(tip)) < 6:
+        raise BadArgument("tip", repr(tip), "a link that at least six joints move")
+    turn = 2 * math.pi
+    way = [dataclasses.replace(j, lower=max(j.lower, -turn), upper=min(j.upper, turn)) for j in whole.joints_above(tip)]
+    chain = dataclasses.replace(
+        whole, links=(named[whole.root], *(named[j.child] for j in reversed(way))), joints=tuple(reversed(way))
+    )
+    if bare := [link.name for link in chain.links if any(shape.kind == "mesh" for shape in link.shapes)]:
+        raise whole.wrong(f"link {bare[0]} with a mesh", "boxes, cylinders or spheres")
+    tree, joints, one = (
+        tree_from_urdf(chain),
+        chain.movable,
+        real([[float(i == j) for j in range(4)] for i in range(4)]),
+    )
+    lower, upper, speed = real([(j.lower, j.upper, j.velocity or math.pi) for j in joints]).T
+    generator, many = torch.Generator().manual_seed(seed), 1024  # random postures: one is not far from any pose
+    share = 2 * torch.rand(many, len(joints), generator=generator, dtype=torch.float64) - 1
+    library = (lower + upper) / 2 + share * ((upper - lower) / 2).clamp_max(math.pi)  # each direction of a joint once
+    base, mount = (one if x is None else x.to("cpu", torch.float64) for x in (obj_from_base, tip_from_hand))
+    link, center, radius, palm = _spheres(chain, hand.to("cpu", torch.float64), mount)
+    above = tree.moves.sum(1).long()[link]  # the number of joints that move each sphere
+    moving, pairs = torch.nonzero((above > 0) & ~palm)[:, 0], torch.nonzero(above - above[:, None] > 1)
+    found = features(tree.frames(library.T.contiguous())[:, :, -1])
+    arm = Arm(chain, tree, lower, upper, speed, base, mount, link, center, radius, moving, pairs, library, found)
+    met = arm.overlaps(arm.sphere_centres(library[:200].T))
+    bodies, owner = torch.unique((link + palm)[pairs], dim=0, return_inverse=True)
+    often = torch.zeros(len(bodies), met.shape[1]).index_add(0, owner, met.float()).gt(0).float().mean(1)
+    return dataclasses.replace(arm, pairs=pairs[often[owner] <= ALWAYS])  # others touch by construction
+
+
+def _spheres(chain: Urdf, hand: Hand, tip_from_hand: Float[Tensor, "4 4"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return link, centre [m] and radius [m] of spheres around an arm's links and the hand's palm, and a palm mask."""
+    cell, bulge = 0.075, 0.01  # [m]: one sphere fills a section of most links; how far it may stand out of a shape
+    covers = [(k, *cover(shape, cell, bulge)) for k, link in enumerate(chain.links) for shape in link.shapes]
+    rows = [(k, *centre, radius) for k, centres, radius in covers for centre in centres]
+    palm = hand.collision_spheres.finger == -1
+    centres = apply(tip_from_hand, hand.sphere_centres(hand.lower)[palm])
+    last = real([len(chain.links) - 1.0]).expand(len(centres), 1)
+    every = torch.cat(
+        [real(rows).reshape(-1, 5), torch.cat([last, centres, hand.collision_spheres.radius[palm, None]], 1)]
+    )
+    return every[:, 0].long(), every[:, 1:4], every[:, 4], torch.arange(len(every)) >= len(rows)

@@ -1,0 +1,171 @@
+"""Inverse kinematics of an arm: which hand poses it reaches, and its way through a grasp.
+
+Postures are moved by damped least squares until the hand is in place: first those of the arm's library whose tips are
+nearest, then along a way each from the one before. A way is w poses: the straight approach of the opened hand, the
+grasp, the lift.
+"""
+
+import dataclasses
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.arm.arm import LEVER, Arm, features
+from torchgrasp.base import in_chunks
+from torchgrasp.errors import Status
+from torchgrasp.geometry.optim import SOLVED
+from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
+from torchgrasp.ik.motion import APPROACH_DISTANCE, COARSE_STEPS, UP, opened_pose
+from torchgrasp.values import Grasps
+
+Way = tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"], Float[Tensor, "g 2"]]
+"""The postures on the way through each grasp, whether the arm can go it, and its ease, as in `Grasps`."""
+
+
+def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
+    """Return a mask of the hand poses that the arm reaches within its joint limits."""
+    target, starts = arm.tip_poses(obj_from_hand), 4  # postures that are tried for a pose
+    reached = torch.zeros(len(obj_from_hand), dtype=torch.bool, device=target.device)
+    for start in _nearest(arm, target, starts).unbind(1):
+        left = torch.nonzero(~reached)[:, 0]
+        reached[left] = _solve(arm, arm.library[start[left]].T, target[..., left], steps=8)[1]
+    return reached.to(obj_from_hand.device)
+
+
+def with_arm(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld) -> Grasps:
+    """Return grasps with the postures of the arm; executable ones through which it has no way become `UNREACHABLE`."""
+    rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
+    way, found, least = follow_grasps(arm, hand, grasps[rows], world)
+    status = grasps.status.index_put((rows[~found],), torch.tensor(int(Status.UNREACHABLE)).to(grasps.status))
+    joints = way.new_zeros(len(grasps), way.shape[2]).index_copy(0, rows, way[:, COARSE_STEPS + 1])
+    ease = least.new_zeros(len(grasps), 2).index_copy(0, rows, least)
+    return dataclasses.replace(grasps, status=status, arm=joints, ease=ease)
+
+
+def follow_grasps(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld) -> Way:
+    """Return the arm's way through each grasp, zeros if there is none.
+
+    It goes through the easiest posture that reaches the grasp, and from which it can follow the whole way: without a
+    jump, a joint beyond its limits, or a collision of its links with the world, each other or the palm.
+    """
+    poses, starts, at = way_of(hand, grasps, world).to(arm.lower), 8, COARSE_STEPS + 1
+    (g, w), tips = poses.shape[:2], arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
+    near = _nearest(arm, tips[..., at], starts).flatten()
+    joints, solved = _solve(arm, arm.library[near].T, tips[..., at].repeat_interleave(starts, 2))
+    solved &= in_chunks(lambda x: (_is_clear(arm, x[:, None], world),), joints.T, 256)[0]
+    ease = torch.where(solved, measure_ease(arm, joints).prod(1), -1.0).view(g, starts)
+    way, found, least = poses.new_zeros(g, w, len(joints)), solved.new_zeros(g), poses.new_zeros(g, 2)
+    for choice in ease.argsort(dim=1, descending=True, stable=True).unbind(1):
+        rows = torch.nonzero(~found & (ease.gather(1, choice[:, None])[:, 0] >= 0))[:, 0]
+        if not len(rows):
+            break
+        path, good = _track(arm, joints[:, rows * starts + choice[rows]], tips[:, :, rows])
+        good &= in_chunks(lambda x: (_is_clear(arm, x, world),), path, 64)[0]
+        rows, path = rows[good], path[good]
+        way[rows], found[rows] = path, True
+        least[rows] = measure_ease(arm, path.flatten(0, 1).T).view(-1, w, 2).amin(1)
+    return way, found, least
+
+
+def way_of(hand: Hand, grasps: Grasps, world: CollisionWorld) -> Float[Tensor, "g w 4 4"]:
+    """Return the hand's poses on its way: in the first half it is opened, in the second half it has closed."""
+    closed, height = grasps.obj_from_hand, 0.1  # [m], of the lift
+    opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
+    share = torch.linspace(0, 1, COARSE_STEPS + 1, device="cpu").to(closed)[:, None]
+    up = (UP if world.plane is None else world.plane.normal).to(closed)
+    before, after = (x[:, None].repeat(1, len(share), 1, 1) for x in (opened, closed))
+    before[..., :3, 3] -= APPROACH_DISTANCE * (1 - share) * grasps.approach[:, None]
+    after[..., :3, 3] += height * share * up
+    return torch.cat([before, after], 1)
+
+
+def _track(
+    arm: Arm, start: Float[Tensor, "n g"], tips: Float[Tensor, "3 4 g w"]
+) -> tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"]]:
+    """Return postures that follow the tips from the grasp both ways, and whether each does so steadily.
+
+    At a speed of 0.1 m/s no joint may turn faster than it can.
+    """
+    speed, at = 0.1, COARSE_STEPS + 1
+    path, steady = {at: start}, torch.ones_like(start[0], dtype=torch.bool)
+    for k, last in [(k, k + 1) for k in reversed(range(at))] + [(k, k - 1) for k in range(at + 1, 2 * at)]:
+        path[k], solved = _solve(arm, path[last], tips[..., k], steps=4)
+        seconds = torch.linalg.vector_norm(tips[:, 3, :, k] - tips[:, 3, :, last], dim=0) / speed
+        steady &= solved & ((path[k] - path[last]).abs() <= arm.speed[:, None] * seconds).all(0)
+    return torch.stack([path[k].T for k in range(2 * at)], 1), steady
+
+
+def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> Bool[Tensor, "g"]:
+    """Return a mask of the ways on which no link touches the world; of whole ways nor another link or the palm."""
+    centres = arm.sphere_centres(path.flatten(0, 1).T).unflatten(2, path.shape[:2])
+    links, radius = centres[:, arm.moving].permute(2, 3, 1, 0), arm.radius[arm.moving]
+    clear = torch.ones_like(path[:, 0, 0], dtype=torch.bool)
+    if world.plane is not None:
+        clear &= (along(links, world.plane) - radius).flatten(1).amin(1) >= world.plane.offset
+    if world.field is not None:  # a lifted object is not in the way
+        clear &= (world.field.query(links[:, : COARSE_STEPS + 2])[0] - radius).flatten(1).amin(1) >= 0
+    if world.obstacles is not None and world.guarded:
+        clear &= (world.obstacles.field.query(links)[0] - radius).flatten(1).amin(1) >= 0
+    if path.shape[1] > 1:  # the links come near each other slowly
+        clear &= ~arm.overlaps(centres[..., ::8].flatten(2)).any(0).view(len(path), -1).any(1)
+    return clear
+
+
+def measure_ease(arm: Arm, joints: Float[Tensor, "n k"]) -> Float[Tensor, "k 2"]:
+    """Return the least distance of a joint from its limits, as a share of half its range, and the manipulability."""
+    lower, upper, motion = arm.lower[:, None], arm.upper[:, None], arm.tip_motion(joints)[1]
+    room = (2 * torch.minimum(joints - lower, upper - joints) / (upper - lower)).amin(0)
+    jacobian = torch.cat([motion[:3] * MILLIMETRE, motion[3:] / LEVER]).permute(2, 0, 1)
+    return torch.stack([room, torch.linalg.det(jacobian @ jacobian.mT).clamp_min(0).sqrt()], 1)
+
+
+def _nearest(arm: Arm, target: Float[Tensor, "3 4 k"], count: int) -> Int[Tensor, "k s"]:
+    """Return the indices of the `count` postures of the library whose tips are nearest to each target."""
+    size = arm.features.square().sum(1) / 2
+    find = lambda wanted: ((size - wanted @ arm.features.T).topk(count, 1, largest=False).indices,)  # noqa: E731
+    return in_chunks(find, features(target), 256)[0]
+
+
+def _solve(
+    arm: Arm, start: Float[Tensor, "n k"], target: Float[Tensor, "3 4 k"], steps: int = 12
+) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "k"]]:
+    """Move postures within their limits until the tips are in place; return them, and whether each tip is.
+
+    The damping is half the squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
+    """
+    joints, rows = start.clone(), torch.arange(start.shape[1], device=start.device)
+    lower, upper, solved = arm.lower[:, None], arm.upper[:, None], torch.zeros_like(rows, dtype=torch.bool)
+    for step in range(steps + 1):
+        tip, motion = arm.tip_motion(joints[:, rows])
+        gap = _gap(tip, target[..., rows])
+        error = gap.square().sum(0)
+        solved[rows] = error < SOLVED
+        left = torch.nonzero(error >= SOLVED)[:, 0]
+        if step == steps or not len(left):
+            break
+        rows, motion, gap, error = rows[left], motion[..., left], gap[:, left], error[left]
+        normal = (motion[:, :, None] * motion[:, None]).sum(0)
+        normal.diagonal().T.add_(error / 2 + 1)
+        turned = joints[:, rows] + _eliminate(normal, (motion * gap[:, None]).sum(0))
+        joints[:, rows] = turned.clamp(lower, upper)
+    return joints, solved
+
+
+def _gap(tip: Float[Tensor, "3 4 k"], target: Float[Tensor, "3 4 k"]) -> Float[Tensor, "6 k"]:
+    """Return the translation [mm] from tips to targets, and the rotation vector times `LEVER`."""
+    axis = torch.linalg.cross(tip[:, :3], target[:, :3], dim=0).sum(1) / 2
+    sine, cosine = torch.linalg.vector_norm(axis, dim=0), ((tip[:, :3] * target[:, :3]).sum((0, 1)) - 1) / 2
+    turn = axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))
+    return torch.cat([(target[:, 3] - tip[:, 3]) / MILLIMETRE, LEVER * turn])
+
+
+def _eliminate(matrix: Float[Tensor, "n n k"], right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """Return the solutions of k positive definite systems, all at once."""
+    rows = torch.cat([matrix, right[:, None]], 1)
+    for i in range(len(rows)):
+        pivot = rows[i] / rows[i, i]
+        rows = rows - rows[:, i, None] * pivot
+        rows[i] = pivot
+    return rows[:, -1]
