@@ -53,7 +53,11 @@ def ur5e_urdf() -> str:
         r, h, *_ = cylinders[len(cylinders) > 1]
         across, along = mass * (3 * r * r + h * h) / 12, mass * r * r / 2
         xx, zz = (along, across) if len(cylinders) > 1 else (across, along)
-        body = f'<inertial><origin xyz="{" ".join(map(str, centre))}"/><mass value="{mass}"/><inertia ixx="{xx}" ixy="0" ixz="0" iyy="{across}" iyz="0" izz="{zz}"/></inertial>'
+        at = " ".join(map(str, centre))
+        body = (
+            f'<inertial><origin xyz="{at}"/><mass value="{mass}"/>'
+            f'<inertia ixx="{xx}" ixy="0" ixz="0" iyy="{across}" iyz="0" izz="{zz}"/></inertial>'
+        )
         parts.append(f'<link name="{name}">{body}{shapes}</link>')
     place = (0.0, 0.0, 0.0)
     for k, name in enumerate(NAMES):
@@ -66,7 +70,8 @@ def ur5e_urdf() -> str:
         )
         place = (A[k], 0.0, D[k])
     parts.append(
-        f'<link name="tool0"/><joint name="flange" type="fixed"><parent link="{names[-1]}"/><child link="tool0"/><origin xyz="{" ".join(map(str, place))}"/></joint></robot>'
+        f'<link name="tool0"/><joint name="flange" type="fixed"><parent link="{names[-1]}"/><child link="tool0"/>'
+        f'<origin xyz="{" ".join(map(str, place))}"/></joint></robot>'
     )
     return "\n".join(parts)
 
@@ -74,7 +79,7 @@ def ur5e_urdf() -> str:
 def _centre(k: int) -> tuple[float, ...]:
     """Return a centre of mass in the frame of its joint, whose published one is in the next joint's frame."""
     turned = rotation_from_rpy((ALPHA[k], 0.0, 0.0)).numpy() @ np.array(CENTRE[k])
-    return tuple((turned + (A[k], 0.0, D[k])).tolist())
+    return tuple((turned + np.array([A[k], 0.0, D[k]])).tolist())
 
 
 def by_products(joints: np.ndarray) -> np.ndarray:

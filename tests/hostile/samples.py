@@ -17,8 +17,10 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 import torchgrasp
+from tests.arm.ur5e import ur5e
 from tests.make import see
 from torchgrasp import PointCloud, fit_shape, load_hand, load_object
+from torchgrasp.arm import Arm
 from torchgrasp.checks import Range
 from torchgrasp.cloud import estimate_normals
 from torchgrasp.control import ClosingReference, GraspController, no_contact, observe
@@ -71,6 +73,7 @@ def special(kind: type) -> Any:
         Contacts: lambda: special(Grasps).contacts,
         Certificate: lambda: special(Grasps).certificate,
         ClosingReference: lambda: ClosingReference.from_grasp(special(torchgrasp.Hand), special(Grasps)),
+        Arm: lambda: ur5e(special(torchgrasp.Hand)),
         GraspController: lambda: GraspController(special(ClosingReference)),
         GraspProblem: grasp_problem,
         PostureLibrary: lambda: PostureLibrary.of(special(torchgrasp.Hand), 100),

@@ -19,7 +19,7 @@ MADE_INSIDE = {
     "JointEstimate", "KinematicTree", "Link", "Normalisation", "Observations", "Outlines", "PreparedCloud", "Progress",
     "SampleFolder", "SceneSpec", "SelfCollision", "Shape", "ShapeDerivatives", "ShapeGP", "Silhouette", "StepContacts",
     "SurfaceJet", "MeanJet", "ClosingTrace", "Urdf", "Advice", "Explanation", "Funnel", "Losses", "Trial",
-    "GraspShards",
+    "GraspShards", "Arm",
 }  # fmt: skip
 """Values that only the library makes, many of them in each step of a loop."""
 THINGS = checked_things()

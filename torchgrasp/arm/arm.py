@@ -61,11 +61,13 @@ class Arm(Value):
         """Return the pose `obj_from_hand` of the hand in each posture of the arm."""
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 
+    @checked
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> Float[Tensor, "3 4 k"]:
         """Return the poses of the tip, in the base's frame, that put the hand at given poses."""
         base_from_tip = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower) @ inverse(self.tip_from_hand)
         return base_from_tip[:, :3].permute(1, 2, 0).contiguous()
 
+    @checked
     def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "3 4 k"], Float[Tensor, "6 n k"]]:
         """Return the tip's poses, and its motion by each joint: translation [mm], rotation times `LEVER`."""
         frames = self.tree.frames(joints)
@@ -74,12 +76,14 @@ class Arm(Value):
         place = torch.where(slides, axes, torch.linalg.cross(axes, tip[:, 3, None] - child[:, 3], dim=0))
         return tip, torch.cat([place / MILLIMETRE, LEVER * torch.where(slides, 0.0, axes)])
 
+    @checked
     def sphere_centres(self, joints: Float[Tensor, "n k"]) -> Float[Tensor, "3 s k"]:
         """Return the centres [m] of all collision spheres in the object's frame."""
         frames, pose = self.tree.frames(joints.contiguous()).index_select(2, self.link), self.obj_from_base
         centres = map_points(frames, self.center)
         return (pose[:3, :3] @ centres.flatten(1)).view_as(centres) + pose[:3, 3, None, None]
 
+    @checked
     def overlaps(self, centres: Float[Tensor, "3 s k"]) -> Bool[Tensor, "p k"]:
         """Return which `pairs` of spheres overlap in each posture, given the centres [m]."""
         one, two = self.pairs.unbind(1)

@@ -30,7 +30,7 @@ def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor,
     reached = torch.zeros(len(obj_from_hand), dtype=torch.bool, device=target.device)
     for start in _nearest(arm, target, starts).unbind(1):
         left = torch.nonzero(~reached)[:, 0]
-        reached[left] = _solve(arm, arm.library[start[left]].T, target[..., left], steps=8)[1]
+        reached[left] = _solve(arm, arm.library[start[left]].T, target[..., left], 8, SOLVED)[1]
     return reached.to(obj_from_hand.device)
 
 
@@ -129,20 +129,21 @@ def _nearest(arm: Arm, target: Float[Tensor, "3 4 k"], count: int) -> Int[Tensor
 
 
 def _solve(
-    arm: Arm, start: Float[Tensor, "n k"], target: Float[Tensor, "3 4 k"], steps: int = 12
+    arm: Arm, start: Float[Tensor, "n k"], target: Float[Tensor, "3 4 k"], steps: int = 12, solved: float = 1e-4
 ) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "k"]]:
     """Move postures within their limits until the tips are in place; return them, and whether each tip is.
 
+    In place means a sum of squared errors below `solved` [mm2], by default of a hundredth of a millimetre.
     The damping is half the squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
     """
     joints, rows = start.clone(), torch.arange(start.shape[1], device=start.device)
-    lower, upper, solved = arm.lower[:, None], arm.upper[:, None], torch.zeros_like(rows, dtype=torch.bool)
+    lower, upper, done = arm.lower[:, None], arm.upper[:, None], torch.zeros_like(rows, dtype=torch.bool)
     for step in range(steps + 1):
         tip, motion = arm.tip_motion(joints[:, rows])
         gap = _gap(tip, target[..., rows])
         error = gap.square().sum(0)
-        solved[rows] = error < SOLVED
-        left = torch.nonzero(error >= SOLVED)[:, 0]
+        done[rows] = error < solved
+        left = torch.nonzero(error >= solved)[:, 0]
         if step == steps or not len(left):
             break
         rows, motion, gap, error = rows[left], motion[..., left], gap[:, left], error[left]
@@ -150,7 +151,7 @@ def _solve(
         normal.diagonal().T.add_(error / 2 + 1)
         turned = joints[:, rows] + _eliminate(normal, (motion * gap[:, None]).sum(0))
         joints[:, rows] = turned.clamp(lower, upper)
-    return joints, solved
+    return joints, done
 
 
 def _gap(tip: Float[Tensor, "3 4 k"], target: Float[Tensor, "3 4 k"]) -> Float[Tensor, "6 k"]:

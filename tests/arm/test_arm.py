@@ -1,0 +1,74 @@
+"""The arm's kinematics beside Denavit and Hartenberg's products and pinocchio; files that are refused."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from tests.arm.ur5e import by_products, ur5e, ur5e_urdf
+from tests.make import random_motion
+from torchgrasp.arm import load_arm
+from torchgrasp.arm.reach import measure_ease, reach_poses
+from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.geometry.frames import inverse
+
+
+def test_poses_are_products_of_the_published_matrices(arm):
+    joints = arm.library[:20]
+    flange = inverse(arm.obj_from_base) @ arm.hand_poses(joints) @ inverse(arm.tip_from_hand)
+    assert np.allclose(flange.numpy(), [by_products(q) for q in joints.numpy()], atol=1e-12)
+
+
+def test_inverse_kinematics_and_manipulability_agree_with_pinocchio(arm):
+    pin = pytest.importorskip("pinocchio")
+    model = pin.buildModelFromXML(ur5e_urdf())
+    data, frame = model.createData(), model.getFrameId("tool0")
+
+    def placed(q):
+        pin.framesForwardKinematics(model, data, q)
+        return data.oMf[frame].homogeneous
+
+    generator, moved = torch.Generator().manual_seed(3), arm.moved(random_motion(4))
+    joints = arm.lower + torch.rand(300, 6, generator=generator, dtype=torch.float64) * (arm.upper - arm.lower)
+    base_from_tip = torch.tensor(np.array([placed(q) for q in joints.numpy()]))
+    poses = moved.obj_from_base @ base_from_tip @ moved.tip_from_hand
+    assert reach_poses(moved, poses).double().mean() > 0.95  # all are reached by some posture
+    ease = measure_ease(arm, joints[:20].T)
+    for q, (room, measure) in zip(joints[:20].numpy(), ease.tolist(), strict=True):
+        jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        assert measure == pytest.approx(abs(np.linalg.det(jacobian)), abs=1e-9)
+        low, high = model.lowerPositionLimit, model.upperPositionLimit
+        assert room == pytest.approx(1 - (np.abs(q - (low + high) / 2) / ((high - low) / 2)).max(), abs=1e-9)
+
+
+def test_poses_out_of_reach_are_refused(arm):
+    """The flange is at most 0.98 m from the shoulder, by the lengths of the links."""
+    poses = arm.hand_poses(arm.library[:50])
+    far = poses.clone()
+    far[:, :3, 3] += 2.2 * torch.nn.functional.normalize(poses[:, :3, 3] - arm.obj_from_base[:3, 3], dim=1)
+    assert not reach_poses(arm, far).any() and reach_poses(arm, poses).double().mean() > 0.95
+    assert reach_poses(arm, poses[:0]).shape == (0,)
+
+
+def test_same_seed_same_library(arm, hand):
+    assert torch.equal(arm.library, ur5e(hand).library) and not torch.equal(arm.library, ur5e(hand, seed=1).library)
+
+
+def test_files_that_are_no_arm_are_refused(hand, tmp_path):
+    def load(text, tip=None):
+        (tmp_path / "arm.urdf").write_text(text)
+        return load_arm(tmp_path / "arm.urdf", hand, tip)
+
+    good = ur5e_urdf()
+    assert load(good).joint_names == load(good, "tool0").joint_names
+    endless = re.sub(r'revolute(.*wrist_3.*) lower="\S+" upper="\S+"', r"continuous\1", good)
+    assert load(endless).upper.tolist() == load(good).upper.tolist() and endless != good
+    with pytest.raises(BadArgument, match=r"tip: .*six joints"):
+        load(good, "wrist_2_link")
+    with pytest.raises(BadArgument, match=r"tip: .*'hand'"):
+        load(good, "hand")
+    with pytest.raises(HandFileError, match="elbow_link with a mesh"):
+        load(re.sub(r"(elbow_link.*?)<cylinder[^>]*>", r'\1<mesh filename="elbow.stl"/>', good, count=1))
+    with pytest.raises(HandFileError, match="urdf"):
+        load("<robot")

@@ -1,0 +1,92 @@
+"""The way of the arm through a grasp: straight, steady, within limits, clear of table, objects and itself."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.arm.ur5e import ur5e
+from tests.make import distance_field, random_motion, real
+from torchgrasp import ContactSpec, Plane, Status, load_object, plan_grasps
+from torchgrasp.arm.reach import follow_grasps, way_of
+from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.plane import move
+from torchgrasp.ik import CollisionWorld
+
+TABLE = CollisionWorld(table=Plane.horizontal(0.0))
+
+
+@pytest.fixture(scope="module")
+def good(grasps):
+    return grasps[grasps.status == Status.OK]
+
+
+def test_the_planner_returns_grasps_that_the_arm_reaches(arm, grasps, good):
+    assert len(good) > 10 and torch.equal(good.status, grasps.status[: len(good)])
+    assert torch.allclose(arm.hand_poses(good.arm), good.obj_from_hand, atol=2e-4)
+    assert bool((good.ease > 0).all()) and bool((grasps.arm[len(good) :] == 0).all())
+    percents = (100 * good.success).round().tolist()
+    keys = list(zip(percents, good.ease.prod(1).tolist(), strict=True))
+    assert keys == sorted(keys, reverse=True) and len(set(percents)) < len(percents)
+
+
+def test_a_way_is_straight_steady_and_within_limits(arm, hand, good):
+    way, found, ease = follow_grasps(arm, hand, good, TABLE)
+    assert bool(found.all())
+    wanted = way_of(hand, good, TABLE)
+    assert torch.allclose(arm.hand_poses(way.flatten(0, 1)).view_as(wanted), wanted, atol=2e-4)
+    begins = good.obj_from_hand[:, :3, 3] - 0.1 * good.approach
+    assert torch.allclose(wanted[:, 0, :2, 3], begins[:, :2]) and torch.allclose(
+        wanted[:, -1, :3, 3], good.obj_from_hand[:, :3, 3] + real([0, 0, 0.1])
+    )
+    assert bool(((way >= arm.lower) & (way <= arm.upper)).all())
+    assert (way[:, 1:] - way[:, :-1]).abs().max() <= torch.pi * 0.0125 / 0.1
+    room = torch.minimum(way - arm.lower, arm.upper - way) / ((arm.upper - arm.lower) / 2)
+    assert torch.allclose(room.flatten(1).amin(1), ease[:, 0])
+
+
+def test_links_keep_clear_of_table_objects_and_each_other(arm, hand, good):
+    """No sphere is below the table; a table at the wrists, or a ball around the forearms, leaves no way."""
+    way, _, _ = follow_grasps(arm, hand, good, TABLE)
+    centres = arm.sphere_centres(way.flatten(0, 1).T)
+    assert (centres[2, arm.moving] - arm.radius[arm.moving, None]).min() >= 0
+    high = CollisionWorld(table=Plane.horizontal(0.75))
+    assert not follow_grasps(arm, hand, good, high)[1].any()
+    inside = distance_field(lambda x: (x - real([-0.3, 0, 0.3])).norm(dim=-1) - 0.4, real([-0.3, 0, 0.3]), 0.6, 0.05)
+    assert not follow_grasps(arm, hand, good, CollisionWorld(inside))[1].any()
+    folded = torch.zeros(6, 1, dtype=torch.float64)
+    folded[2] = 3.1  # the forearm beside the upper arm, the wrist at the shoulder
+    assert not arm.overlaps(arm.sphere_centres(0 * folded)).any()
+    assert arm.overlaps(arm.sphere_centres(folded)).any()
+
+
+def test_an_arm_far_away_reaches_nothing_and_the_planner_says_so(hand):
+    plan = {"spec": ContactSpec(table=0.0), "starts": 8, "time_budget": 0.001}
+    found = plan_grasps(load_object("cylinder").view, hand, arm=ur5e(hand, (-2.0, 0.0, 0.0)), **plan)
+    assert Status.OK not in found.status
+    with pytest.raises(BadArgument, match=r"arm: .*many clouds"):
+        plan_grasps([load_object("cylinder").view], hand, arm=ur5e(hand), **plan)
+
+
+def test_same_seed_same_grasps_in_any_frame(arm, hand, grasps):
+    motion, table = random_motion(7), Plane.horizontal(0.0)
+    again = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=24, arm=arm)
+    assert torch.equal(again.arm, grasps.arm) and torch.equal(again.obj_from_hand, grasps.obj_from_hand)
+    view, spec = move(load_object("cylinder").view.to(torch.float64), motion), ContactSpec(table=table.moved(motion))
+    moved = plan_grasps(view, hand, spec, starts=24, arm=arm.moved(motion))
+    assert torch.equal(moved.status, grasps.status) and torch.allclose(moved.arm, grasps.arm, atol=1e-6)
+
+
+def test_reachable_counts_beside_the_arm(arm, hand):
+    plan = {"spec": ContactSpec(table=0.0), "starts": 8, "time_budget": 0.001, "arm": arm}
+    found = plan_grasps(load_object("cylinder").view, hand, reachable=lambda x: x[:, 0, 3] > 9.0, **plan)
+    assert Status.OK not in found.status
+
+
+def test_saved_grasps_keep_the_arm(good, tmp_path):
+    from torchgrasp import load_grasps
+
+    good.save(tmp_path / "grasps.safetensors")
+    found = load_grasps(tmp_path / "grasps.safetensors")
+    assert torch.equal(found.arm, good.arm) and torch.equal(found.ease, good.ease)
+    assert dataclasses.replace(good, arm=None, ease=None)[0].arm is None
