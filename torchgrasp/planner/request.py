@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypedDict, TypeVar
 
 from torchgrasp.arm.arm import Arm
-from torchgrasp.checks import Count, Range, Seed, checked
 from torchgrasp.checks import Count, Range, Seed, Taken, checked
 from torchgrasp.errors import BadArgument
 from torchgrasp.hand.hand import Hand
