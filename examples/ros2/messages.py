@@ -129,7 +129,7 @@ def write_grasps(types: Types, text: str, frame: str, stamp: Any) -> list[Any]:
                     orientation=types.Quaternion(**content["grasp_pose"]["pose"]["orientation"]),
                 ),
             ),
-            grasp_quality=content["grasp_quality"],
+            grasp_quality=max(0.0, content["grasp_quality"]),  # MoveIt sorts by it, which NaN would break
             pre_grasp_approach=_translation(types, content["pre_grasp_approach"], header),
             post_grasp_retreat=_translation(types, content["post_grasp_retreat"], header),
             post_place_retreat=_translation(types, content["post_place_retreat"], header),

@@ -62,7 +62,8 @@ def plan(
         cloud = messages.read_cloud(goal.cloud, frame_from_cloud, camera)
         table = None if math.isnan(goal.table) else goal.table
         if goal.cut:
-            cloud, table = cut_object(cloud, torch.tensor([0.0, 0.0, 1.0]))
+            near = None if math.isnan(goal.near.x) else torch.tensor([goal.near.x, goal.near.y, goal.near.z])
+            cloud, table = cut_object(cloud, torch.tensor([0.0, 0.0, 1.0]), near, gap=0.02)
         cloud = remove_outliers(voxel_downsample(cloud, 0.002))
         tell("cloud", f"{len(cloud)} points")
         observer = lambda stage, message, _: tell(stage, message)  # noqa: E731

@@ -1,5 +1,6 @@
 """The planning node without ROS: a cloud from an .mcap file goes in, grasps go into an .mcap file and come back."""
 
+import dataclasses
 import functools
 import json
 import math
@@ -11,9 +12,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.pinch import pinch
 from tests.ros2 import bags
 from tests.ros2.test_clouds import FLOAT32, XYZ, cloud
 from torchgrasp import Status, load_grasps, load_hand, load_object
+from torchgrasp.export import format_moveit
 from torchgrasp.geometry.frames import inverse, rigid
 
 HAND = "leap"  # whose URDF has another order of joints than the driver
@@ -40,7 +43,16 @@ def seen():
 
 
 def goal(**more):
-    fields = {"cloud": seen(), "hand": HAND, "gravity_frame": "base", "object_id": "can", "cut": True, "most": 3}
+    near = bags.message("geometry_msgs/Point", x=math.nan, y=0.0, z=0.0)
+    fields = {
+        "near": near,
+        "cloud": seen(),
+        "hand": HAND,
+        "gravity_frame": "base",
+        "object_id": "can",
+        "cut": True,
+        "most": 3,
+    }
     return bags.message("torchgrasp_ros/PlanGrasp_Goal", **fields | {"table": math.nan} | more)
 
 
@@ -105,6 +117,30 @@ def test_a_goal_without_grasps_says_why(wrong, words):
     bags.through_cdr(
         bags.message("torchgrasp_ros/PlanGrasp_Result", **found._asdict()), "torchgrasp_ros/PlanGrasp_Result"
     )
+
+
+def test_the_object_at_a_place_is_cut_out_of_a_scene():
+    """Nothing is within half a metre of a place 2 m off; at the cylinder there is the cylinder, without its table."""
+    told = []
+
+    def stop(stage, message):
+        told.append(message)
+        raise plan_node.GraspError("enough")
+
+    for x in (0.0, 2.0):
+        near = bags.message("geometry_msgs/Point", x=x, y=0.0, z=0.05)
+        found = plan_node.plan(bags.types(), goal(near=near), CAMERA.numpy(), None, plan_node.Settings(), stop)
+        assert (found.message == "enough") == (x == 0.0)
+    assert len(told) == 1 and int(told[0].split()[0]) <= len(load_object("cylinder").view)
+
+
+def test_an_unknown_quality_is_0_in_a_message():
+    hand, grasp = pinch("allegro")
+    text = format_moveit(hand, dataclasses.replace(grasp, known=torch.zeros(1, dtype=torch.bool)))
+    assert "grasp_quality: .nan" in text
+    (message,) = messages.write_grasps(bags.types(), text, "base", bags.time(1))
+    assert message.grasp_quality == 0.0
+    bags.through_cdr(message, "moveit_msgs/Grasp")
 
 
 def test_a_stage_that_is_told_can_cancel():
