@@ -209,7 +209,8 @@ def test_grasp_writes_grasps_and_pages_for_a_shipped_object_by_name(tmp_path, ru
     for stage in ("cloud", "shape", "plan", "certify", "query", "refine", "report"):
         assert any(line.startswith(stage) for line in out.splitlines())
     folder = tmp_path / "out" / "cylinder"
-    assert sorted(p.name for p in folder.iterdir()) == ["grasps.safetensors", "report.html", "view.html"]
+    names = ["grasps.safetensors", "report.html", "surface.ply", "view.html"]
+    assert sorted(p.name for p in folder.iterdir()) == names
     assert 'href="view.html"' in (folder / "report.html").read_text()
     found = load_grasps(folder / "grasps.safetensors")
     assert found.meta["hand"] == "barrett" and found.meta["seed"] == "0" and "metre" in found.meta["units"]

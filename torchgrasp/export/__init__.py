@@ -4,10 +4,11 @@ from torchgrasp.export.foreign import ForeignGrasps, grasps_from_joints, read_fo
 from torchgrasp.export.other_formats import check_surface_path, format_graspgen, largest_std
 from torchgrasp.export.other_formats import save_dexgraspbench, save_surface
 from torchgrasp.export.postures import format_grasps, format_keyframes
+from torchgrasp.export.play import save_play
 from torchgrasp.export.ros_messages import format_moveit, format_trajectories
 
 __all__ = [
     "ForeignGrasps", "check_surface_path", "format_graspgen", "format_grasps", "format_keyframes", "format_moveit",
     "format_trajectories", "grasps_from_joints", "largest_std", "read_foreign", "save_dexgraspbench",
-    "save_surface",
+    "save_play", "save_surface",
 ]  # fmt: skip

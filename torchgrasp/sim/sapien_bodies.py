@@ -59,7 +59,7 @@ def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterab
     """
     scale = 0.01
     body = physx.PhysxRigidDynamicComponent()
-    for vertices in (some for hull in hulls for some in _split(hull)):
+    for vertices in (some for hull in hulls for some in split_hull(hull)):
         scaled = (vertices / scale).astype(np.float32)
         shape = physx.PhysxCollisionShapeConvexMesh(scaled, np.full(3, scale, np.float32), material)
         shape.min_patch_radius = patch
@@ -76,7 +76,7 @@ def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterab
     return body
 
 
-def _split(hull: np.ndarray) -> Iterator[np.ndarray]:
+def split_hull(hull: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the vertices of a convex hull; then of its foot, a pyramid, if PhysX keeps not all vertices of the hull."""
     most, lowest = 129, 100  # PhysX keeps 255 faces: as many as 129 vertices have
     yield hull

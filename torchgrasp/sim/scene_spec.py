@@ -80,6 +80,7 @@ class SceneSpec:
         self_pairs: pairs of the hand's links that collide with each other.
         yields: largest displacement [m] of the mount along each axis of the world; 0 if the mount is stiff.
         start: displacement [m] of a mount that yields at the beginning.
+        mount: the prismatic joints of the mount, instead of those that lift, approach and yield.
     """
 
     urdf_path: Path | str
@@ -103,6 +104,7 @@ class SceneSpec:
     yields: float = 0.0
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     table_friction: float | None = None
+    mount: "tuple[Slide, ...] | None" = None
 
     @functools.cached_property
     def urdf(self) -> Urdf:
@@ -112,6 +114,8 @@ class SceneSpec:
     @functools.cached_property
     def slides(self) -> list["Slide"]:
         """The prismatic joints of the mount, which carries the hand; in order from the world to the hand."""
+        if self.mount is not None:
+            return list(self.mount)
         slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, self.travel + 0.05, 0.0)]
         length = float(np.linalg.norm(self.approach))
         if length > 0:

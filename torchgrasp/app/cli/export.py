@@ -6,7 +6,7 @@ import inspect
 import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from torchgrasp.hand.load import hand_of
 from torchgrasp.lazy import trimesh
 from torchgrasp.planner.problem import digest
 from torchgrasp.shape import Surface, extract_surface, fit_shape
-from torchgrasp.specs import ContactSpec
+from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
 Unit = Literal["m", "cm", "mm"]
@@ -39,29 +39,38 @@ TEXTS: dict[str, Callable[..., str]] = {
 """Writers of formats that are one text file and do not name the object."""
 
 
-@arguments(path="out", folder="out", object_path="object", name="hand", fingers="grasps", object_id="object")
+@arguments(
+    path="out", folder="out", object_path="object", name="hand", fingers="grasps", object_id="object", mesh="object"
+)
 class Export(Command):
     """Write the best executable grasps of a file for other programs, with frames and the order of joints."""
 
     grasps: Path = positional("grasps.safetensors of `torchgrasp grasp`, or a file of the folder grasps of `evaluate`")
-    out: Path = required("file to write; for dexgraspbench a folder, with one file for each grasp")
-    format: Literal["json", "mujoco", "moveit", "ros2", "dexgraspbench", "graspgen", "glb"] = option(
+    out: Path = required("file to write; for dexgraspbench and play-... a folder")
+    format: Literal[
+        "json", "mujoco", "moveit", "ros2", "dexgraspbench", "graspgen", "glb",
+        "play-mujoco", "play-maniskill", "play-newton",
+    ] = option(
         "json",
         "json: frames, units, forces and torques. mujoco: the hand as a model with keyframes. moveit: a list of "
         "moveit_msgs/Grasp in YAML. ros2: a JointTrajectory each. dexgraspbench, graspgen: files of these projects. "
-        "glb: hand and object at the best grasp, for slides",
-    )
+        "glb: hand and object at the best grasp, for slides. play-...: hand, object, motion and a script that plays it",
+    )  # fmt: skip
     hand: str | None = option(None, "name or folder of the hand; by default the name in the file")
     most: Count = option(20, "number of grasps, the best first")
-    force: float = option(4.0, "normal force of the strongest finger [N] in the squeeze")
+    force: float | None = option(
+        None, "normal force of the strongest finger [N] in the squeeze; by default 4, in play-... what the mass needs"
+    )
     kp: float | None = option(
         None, "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's"
     )
     object: str | None = option(
         None,
         "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the object's id; "
-        "glb: a mesh, or the cloud of the plan for the estimated surface",
+        "glb, play-...: a mesh, or the cloud of the plan for its estimated surface; by default surface.ply of GRASPS",
     )
+    mass: float = option(0.1, "play-...: mass of the object [kg]")
+    friction: float = option(0.8, "play-...: coefficient of friction")
     rename: tuple[str, ...] = option(
         (), "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file of such an object"
     )
@@ -72,8 +81,10 @@ class Export(Command):
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return the exit code."""
-        named = self.format in ("dexgraspbench", "graspgen", "glb")
-        if named and self.object is None:
+        plays, shown = self.format.startswith("play-"), self.grasps.with_name("surface.ply")
+        named = plays or self.format in ("dexgraspbench", "graspgen", "glb")
+        found = (plays or self.format == "glb") and shown.is_file()
+        if named and self.object is None and not found:
             raise BadArgument("--object", None, f"a path with --format {self.format}")
         with naming(path="--flange"):
             flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
@@ -89,23 +100,31 @@ class Export(Command):
             found = f"{hand.name}, whose files are not those that were planned with"
             raise BadArgument("--hand", found, "the same hand")
         best = planned[planned.status == Status.OK][: self.most]
+        force, body = 4.0 if self.force is None else self.force, Path(self.object or shown)
         with naming(hand="--format"):
-            if self.format == "dexgraspbench":
+            if plays and len(best):
+                player: Any = self.format.removeprefix("play-")
+                spec = TrialSpec(friction=self.friction, mass=self.mass, force=self.force, kp=self.kp)
+                mesh = self._body(planned, body)
+                if isinstance(mesh, Surface):
+                    mesh = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
+                formats.save_play(hand, best, self.out, player, mesh, spec)
+            elif self.format == "dexgraspbench":
                 stiffness = {} if self.kp is None else {"kp": self.kp}
-                formats.save_dexgraspbench(hand, best, self.out, str(self.object), self.force, **stiffness)
+                formats.save_dexgraspbench(hand, best, self.out, str(self.object), force, **stiffness)
             elif self.format == "glb":
                 if len(best):
-                    write_glb(self.out, hand, best[0], self._body(planned))
+                    write_glb(self.out, hand, best[0], self._body(planned, body))
             elif self.format == "graspgen":
                 write_file(self.out, formats.format_graspgen(best, str(self.object)))
-            else:
-                write_file(self.out, TEXTS[self.format](hand, best, self.force, self.kp, **robot))
+            elif self.format in TEXTS:
+                write_file(self.out, TEXTS[self.format](hand, best, force, self.kp, **robot))
         print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
         return 0 if len(best) else 1
 
-    def _body(self, planned: Grasps) -> "Surface | trimesh.Trimesh":
-        """Read the object of --format glb: a mesh, or the surface that the cloud of the plan tells."""
-        path = find_cloud(Path(str(self.object)), "--object")
+    def _body(self, planned: Grasps, path: Path) -> "Surface | trimesh.Trimesh":
+        """Read the object of glb or play: a mesh, or the surface that the cloud of the plan tells."""
+        path = find_cloud(path, "--object")
         with contextlib.suppress(BadArgument):
             cloud = read_cloud(path)
             if digest(cloud) == planned.meta.get("cloud_sha256"):

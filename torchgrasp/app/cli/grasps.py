@@ -17,6 +17,7 @@ from torchgrasp.cloud.pose import find_plausible
 from torchgrasp.data.shipped import DATA, MASSES, list_objects, load_object
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.lift import close_hand
+from torchgrasp.export import save_surface
 from torchgrasp.files import format_columns, format_line, sha256
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import as_plane
@@ -46,10 +47,10 @@ Among = Literal["auto"] | None
 class Grasp(Command):
     """Plan grasps of an object in a partial cloud or a scene; with a mesh, also close the hand in simulation.
 
-    Writes grasps.safetensors, report.html and the 3D page view.html into the output folder. If no grasp is executable,
-    one setting at a time is changed, and the change that helps most is named. The cloud is checked as by `cloud check`.
-    It is refused if the camera is below the table or contradicts the points, or if the unit is wrong. A cloud with two
-    bodies, with the table or with another plane is refused, too. Other findings are printed as advice.
+    Writes grasps.safetensors, surface.ply, report.html and the 3D page view.html into the output folder. If no grasp is
+    executable, one setting at a time is changed, and the change that helps most is named. The cloud is checked as by
+    `cloud check`. It is refused if the camera is below the table or contradicts the points, or if the unit is wrong. A
+    cloud with two bodies, with the table or with another plane is refused, too. Other findings are printed as advice.
     """
 
     cloud: Path = positional(
@@ -251,9 +252,11 @@ STAGES = ("shape", "plan", "certify", "query", "refine")  # stages of planning, 
 
 
 def write_results(out: Path, run: Run, no_report: bool) -> str:
-    """Write the grasps of a run, and its HTML pages unless `no_report`; return the paths as text."""
+    """Write grasps and estimated surface of a run, and its HTML pages unless `no_report`; return the paths as text."""
     paths = [out / "grasps.safetensors"]
     run.grasps.save(paths[0])
+    if len(run.executable):
+        paths.append(save_surface(run.surface, out / "surface.ply"))
     if not no_report:
         paths += [write_report(out / "report.html", run, VIEW), write_viewer(out / VIEW, run)]
     return ", ".join(map(str, paths))
