@@ -76,14 +76,14 @@ def save_play(
     if not torch.equal(world_from_obj, torch.eye(4, dtype=torch.float64)):
         solid, *pieces = (body.copy().apply_transform(world_from_obj.numpy()) for body in (solid, *pieces))
     scene = _scene(hand, spec, solid, pieces)
-    write_file(folder / "object.ply", solid.export(file_type="ply"))
+    write_file(folder / "object.ply", _mesh_file(solid, "ply"))
     write_file(folder / "play.json", format_json(describe_play(hand, grasps, world_from_obj, scene, spec)))
     if player in ("mujoco", "newton"):
         write_file(folder / "scene.xml", _on_base(scene_mjcf(scene)))
     elif player == "maniskill":
         write_file(folder / "hand.urdf", mounted_urdf(scene))
         for k, corners in enumerate(some for hull in scene.hulls[0] for some in split_hull(hull)):
-            write_file(folder / f"part_{k}.obj", _large(corners))
+            write_file(folder / f"part_{k}.obj", _mesh_file(hull(100.0 * corners), "obj"))
     for path in (Path(__file__).parent / "templates").glob(f"{player}*.py.txt"):
         name = path.name.removeprefix(f"{player}").removesuffix(".py.txt").removeprefix("_") or "play"
         write_file(folder / f"{name}.py", path.read_text("utf-8"))
@@ -101,7 +101,8 @@ def _world_from_obj(grasps: Grasps, mesh: "trimesh.Trimesh") -> Float[Tensor, "4
 def _scene(hand: Hand, spec: TrialSpec, mesh: "trimesh.Trimesh", parts: "Sequence[trimesh.Trimesh]") -> SceneSpec:
     """Return the scene with all joints at zero, and the hand's mount along the axes of its root link."""
     reach = spec.approach + spec.lift_height + 0.1  # [m]
-    slides = [Slide(f"mount_{x}", axis, -reach, reach, 0.0) for x, axis in zip("xyz", np.eye(3).tolist(), strict=True)]
+    axes = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+    slides = [Slide(f"mount_{x}", axis, -reach, reach, 0.0) for x, axis in axes.items()]
     drives = {name: x if spec.kp is None else x._replace(kp=spec.kp) for name, x in hand.actuators.items()}
     mass = spec.mass if spec.density is None else spec.density * float(mesh.volume)
     return SceneSpec(
@@ -185,9 +186,10 @@ def describe_play(
     }
 
 
-def _large(corners: np.ndarray) -> str:
-    """Return the hull of points as an .obj file, a hundred times as large."""
-    return hull(100.0 * corners).export(file_type="obj", include_normals=False)
+def _mesh_file(mesh: "trimesh.Trimesh", kind: str) -> bytes:
+    """Return the content of a mesh's file of a kind, as "ply"."""
+    content = mesh.export(file_type=kind)
+    return content if isinstance(content, bytes) else str(content).encode()
 
 
 def _on_base(mjcf: str) -> str:
