@@ -7,15 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.campaign.cheap import campaign, contents, work_on
-from tests.data.others import read_foreign
+from tests.data.others import ROOT, read_foreign
+from tests.make import load_hand
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.data import GraspShards, read_shards, write_parquet
 from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
+from torchgrasp.geometry.frames import apply
 
 parquet = pytest.importorskip("pyarrow.parquet")
 JOBS = 21
+SAMPLE = ROOT / "examples" / "sample"
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +82,26 @@ def test_hugging_face_and_croissant_read_it_offline(shards: GraspShards, written
     assert found["errors"] == [] and found["name"].startswith("grasps-toy-")
     check_rows(shards, found["grasps.records"])
     check_views(shards, found["views.records"])
+
+
+def test_the_shipped_sample_loads_in_one_line(tmp_path: Path):
+    """A thousand grasps in at most 5 MB, tried in simulation; their numbers fit the hand and each other."""
+    assert sum(x.stat().st_size for x in SAMPLE.rglob("*") if x.is_file()) <= 5e6
+    found = read_foreign("tables", SAMPLE, tmp_path)
+    grasps = found["grasps.rows"]
+    assert len(grasps["grasp"]) == 1000 and grasps == found["grasps.records"]
+    passed = [tries == ["OK"] for tries in grasps["outcomes"]]
+    assert passed == [share == 1.0 for share in grasps["simulated"]] and sum(found["views.rows"]["passed"]) == sum(
+        passed
+    )
+    assert 0.5 < np.mean(passed) < 1.0, "verdicts of both kinds"
+    hand = load_hand("allegro")
+    asked = json.loads((SAMPLE / "source.json").read_text())["asked"]["hand"]
+    assert asked["joint_names"] == ", ".join(hand.joint_names) and asked["sha256"] == hand.source.sha256
+    columns = ("joints", "obj_from_hand", "contacts")
+    joints, poses, contacts = (torch.tensor(grasps[name], dtype=torch.float64) for name in columns)
+    gap = (apply(poses, hand.tip_centres(joints)) - contacts).norm(dim=-1) - hand.tip_radius.double()
+    assert float(gap.abs().max()) < 1e-3, "fingertips touch their contacts [m]: joints have the hand's order"
 
 
 def test_an_export_that_was_broken_off_goes_on_and_others_are_refused(

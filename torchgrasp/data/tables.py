@@ -38,7 +38,8 @@ def as_table(columns: Mapping[str, Any], meta: Mapping[str, str]) -> Any:
 
 def pack_table(table: Any) -> bytes:
     """Return the bytes of the Parquet file of a table."""
-    import_arrow().parquet.write_table(table, buffer := io.BytesIO(), compression="zstd")
+    # Without dictionaries: hardly any number comes twice.
+    import_arrow().parquet.write_table(table, buffer := io.BytesIO(), compression="zstd", use_dictionary=False)
     return buffer.getvalue()
 
 
