@@ -268,12 +268,12 @@ def closure_margin(points: Tensor, normals: Tensor, friction: float, edges: int 
     return largest_share(wrenches), int(np.linalg.matrix_rank(wrenches, tol=1e-3))
 
 
-def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run Python in a process of its own that can import the library and the helpers of the tests."""
+def run_python(*arguments: str, given: str = "") -> subprocess.CompletedProcess[str]:
+    """Run Python in a process of its own that can import the library and the helpers of the tests, `given` a text."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = os.environ | {"PYTHONPATH": path}
     command = [sys.executable, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=600, env=environment)
+    return subprocess.run(command, input=given, capture_output=True, text=True, timeout=600, env=environment)
 
 
 def see(*boxes: tuple[float, ...], pose: Tensor | None = None) -> Scene:

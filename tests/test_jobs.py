@@ -9,7 +9,8 @@ import time
 import pytest
 import torch
 
-from torchgrasp.errors import BadArgument, Status
+from tests.make import run_python
+from torchgrasp.errors import BadArgument, NoWorkers, Status
 from torchgrasp.jobs import pack, run_as_they_end, run_tasks, unpack
 from torchgrasp.planner.schedule import Batch
 from torchgrasp.values import PointCloud
@@ -103,8 +104,23 @@ def test_workers_that_die_before_they_take_a_task_are_replaced(tmp_path):
 
 
 @pytest.mark.promise("F4")
-def test_workers_that_always_die_before_they_take_a_task_end(tmp_path):
-    assert list(run_tasks(Heavy(str(tmp_path), 1000), [(2,)], workers=1)) == [Status.WORKER_DIED]
+def test_workers_that_always_die_before_they_take_a_task_are_one_error_however_many_the_tasks(tmp_path):
+    with pytest.raises(NoWorkers, match=r"no worker process can start.*__main__"):
+        list(run_tasks(Heavy(str(tmp_path), 1000), [(2,)] * 50, workers=1))
+
+
+SCRIPT = """
+from torchgrasp.jobs import run_tasks
+print("once", flush=True)
+print(list(run_tasks(pow, [(3, 2), (4, 2)], workers=1)))
+"""
+
+
+@pytest.mark.parametrize("way", ["file", "stdin"])
+def test_a_script_without_a_guard_runs_once_and_its_workers_work(way, tmp_path):
+    (path := tmp_path / "script.py").write_text(SCRIPT)
+    found = run_python(str(path)) if way == "file" else run_python("-", given=SCRIPT)
+    assert found.stdout == "once\n[9, 16]\n" and not found.stderr
 
 
 def test_bad_arguments_are_named_at_once():

@@ -81,6 +81,14 @@ class MissingExtra(GraspError, ImportError):
         self.package, self.extra = package, extra
 
 
+class NoWorkers(GraspError, RuntimeError):
+    """No worker process can start."""
+
+    def __init__(self) -> None:
+        fix = 'workers=0, or in a script `if __name__ == "__main__":` around the call'
+        super().__init__(f"no worker process can start; the standard error says why. What may help: {fix}")
+
+
 class IndefiniteCovariance(GraspError, ValueError):
     """A covariance matrix is not positive definite. The library never adds jitter."""
 

@@ -11,16 +11,19 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, TimeoutError
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import reduction, spawn
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import torch
 
 from torchgrasp.checks import Range, checked
-from torchgrasp.errors import MissingExtra, Status
+from torchgrasp.errors import MissingExtra, NoWorkers, Status
 from torchgrasp.threads import one_thread
 
 Result = TypeVar("Result")
 Task = tuple[Any, ...]
+_starting = threading.Lock()
 
 
 @checked
@@ -34,10 +37,11 @@ def run_tasks(
 
     Each task runs on one thread of a separate process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task
     whose process dies twice gives `Status.WORKER_DIED`. The error of a task is raised in place of its result. All
-    workers end when the caller stops iterating.
+    workers end when the caller stops iterating. Raises `NoWorkers` if no process can start.
 
-    Each worker imports the module of the function. Tasks must hold no tensors, because processes would share them: see
-    `pack`. If `workers` is 0, the tasks run in this process, without the `limit` [s] on the time of a task.
+    Each worker imports the module of the function, but not the caller's script, unless the function is of the script.
+    Tasks must hold no tensors, because processes would share them: see `pack`. If `workers` is 0, the tasks run in this
+    process, without the `limit` [s] on the time of a task.
     """
     return _in_order(_run(function, tasks, workers, limit))
 
@@ -80,11 +84,14 @@ def _run(
             yield number, future
         return
     waiting, died = deque(enumerate(tasks)), set[int]()
-    broken = 0
+    broken, worked = 0, False
     while waiting:
         before = len(waiting)
         yield from _run_pool(function, waiting, died, workers, limit)
         broken = broken + 1 if len(waiting) == before else 0
+        worked = worked or not broken or bool(died)
+        if broken == 2 and not worked:
+            raise NoWorkers
         if broken == 2:
             broken = 0
             yield waiting.popleft()[0], Status.WORKER_DIED
@@ -99,8 +106,11 @@ def _run_pool(
     except ImportError as error:
         raise MissingExtra("pebble", "sim") from error
     # The initializer imports the module of the function before the time of the first task begins.
-    count, spawn = min(workers, len(waiting)), multiprocessing.get_context("spawn")
-    pool = ProcessPool(count, initializer=_begin, initargs=[function], context=spawn)
+    own = b"__main__" in bytes(reduction.ForkingPickler.dumps(function))  # only the script has the function
+    pool = ProcessPool(
+        min(workers, len(waiting)), initializer=_begin, initargs=[function],
+        context=multiprocessing.get_context("spawn") if own else _Apart(),
+    )  # fmt: skip
     ended = queue.SimpleQueue[int]()
     running: dict[int, tuple[Task, Future[Result]]] = {}
     try:
@@ -135,6 +145,26 @@ def _run_pool(
         pool.stop()
         with contextlib.suppress(TimeoutError):  # a signal can leave pebble's threads waiting for each other
             pool.join(10.0)
+
+
+class _Process(SpawnProcess):
+    """A process that does not run the caller's script, which would begin the work anew where it has no guard."""
+
+    def start(self) -> None:
+        """Start the process without the name of the script."""
+        with _starting:
+            known = spawn.get_preparation_data
+            spawn.get_preparation_data = lambda name: {k: x for k, x in known(name).items() if k[:9] != "init_main"}
+            try:
+                super().start()
+            finally:
+                spawn.get_preparation_data = known
+
+
+class _Apart(SpawnContext):
+    """The way in which `_Process` starts."""
+
+    Process = _Process
 
 
 def _begin(function: Callable[..., Any]) -> None:
