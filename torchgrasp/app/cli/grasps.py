@@ -9,6 +9,7 @@ from typing import Any, Literal
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import Command, Progress, arguments, naming, nested, option, positional
 from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, write_report
+from torchgrasp.app.report.recording import import_rerun, write_recording
 from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.checks import Count, Seed
@@ -83,12 +84,15 @@ class Grasp(Command):
     )
     avoid: str | None = option(None, "where no contact may be: a mesh or a box, as in --keep")
     no_report: bool = option(False, "write the grasps without the pages")
+    rerun: bool = option(False, 'also write run.rrd, a recording of plan and closing (needs the extra "rerun")')
 
     def run(self) -> int:
         """Plan grasps, close on the object if asked, and write the results; return the exit code."""
         path = inputs.find_cloud(self.cloud)
         out = Path("out") / inputs.object_name(path) if self.out is None else self.out
         inputs.check_folder(out)
+        if self.rerun:
+            import_rerun()
         scene = is_scene(path)
         self._check_choice(scene)
         _ = self._where  # refused before any work
@@ -151,7 +155,7 @@ class Grasp(Command):
                 closure = close_hand(run.executable[0], hand, true_mesh, trial, seed=self.seed, **options)
                 progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
                 run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
-            progress.end("report", write_results(out, run, self.no_report))
+            progress.end("report", self._write(out, run))
         executable = print_grasps(run)
         return 0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
 
@@ -211,7 +215,7 @@ class Grasp(Command):
             stages, plan = tuple(progress.stages), progress.values.get("plan")
             told = explanation, self._costs(grasps, hand, shape)
             run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, None, None, scene, *told)
-            progress.end("report", write_results(out, run, self.no_report))
+            progress.end("report", self._write(out, run))
         return 0 if print_grasps(run) else 1
 
     def _with_table(self, scene: Scene, chosen: bool) -> Scene:
@@ -234,6 +238,18 @@ class Grasp(Command):
         inputs.print_notes(tuple(f"objects {how}: {str(sorted(some))[1:-1]}" for how, some in said.items() if some))
         return again
 
+    def _write(self, out: Path, run: Run) -> str:
+        """Write grasps and estimated surface of a run, its HTML pages unless --no-report, and its recording."""
+        paths = [out / "grasps.safetensors"]
+        run.grasps.save(paths[0])
+        if len(run.executable):
+            paths.append(save_surface(run.surface, out / "surface.ply"))
+        if not self.no_report:
+            paths += [write_report(out / "report.html", run, VIEW), write_viewer(out / VIEW, run)]
+        if self.rerun:
+            paths.append(write_recording(out / "run.rrd", run))
+        return ", ".join(map(str, paths))
+
     def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: Progress):
         """Plan for the objects of a scene until one is easy; return the scene with it as target, grasps and shape."""
         # An object with this predicted success is easy enough: the others are not tried.
@@ -249,17 +265,6 @@ class Grasp(Command):
 
 
 STAGES = ("shape", "plan", "certify", "query", "refine")  # stages of planning, as the planner reports them
-
-
-def write_results(out: Path, run: Run, no_report: bool) -> str:
-    """Write grasps and estimated surface of a run, and its HTML pages unless `no_report`; return the paths as text."""
-    paths = [out / "grasps.safetensors"]
-    run.grasps.save(paths[0])
-    if len(run.executable):
-        paths.append(save_surface(run.surface, out / "surface.ply"))
-    if not no_report:
-        paths += [write_report(out / "report.html", run, VIEW), write_viewer(out / VIEW, run)]
-    return ", ".join(map(str, paths))
 
 
 def print_grasps(run: Run) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from torchgrasp.app.report.canvas import OBJECT, map_colors, rgb
-from torchgrasp.app.report.solids import link_poses, solids_of_links
+from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import to_array
 from torchgrasp.checks import checked
 from torchgrasp.control.reference import check_single
@@ -41,14 +41,10 @@ def write_glb(path: Path | str, hand: Hand, grasp: Grasps, body: "Surface | trim
     scene.add_geometry(_solid(body), geom_name="object", node_name="object", transform=y_up)
     joints, names = hand.expand_joints(grasp.joints.double()), hand.tree.joint_names
     poses = link_poses(hand, joints, names, grasp.obj_from_hand)[0].cpu().numpy()
-    solids = solids_of_links(hand)
-    for link, name in enumerate(hand.tree.link_names):
-        if mine := [s for s in solids if s.link == link]:
-            points, normals = np.concatenate([s.vertices for s in mine]), np.concatenate([s.normals for s in mine])
-            starts = np.cumsum([0, *(len(s.vertices) for s in mine)])
-            faces = np.concatenate([s.faces + start for s, start in zip(mine, starts, strict=False)])
-            shape = trimesh.Trimesh(points, faces, vertex_normals=normals, visual=_paint(mine[0].color), process=False)
-            scene.add_geometry(shape, geom_name=name, node_name=name, transform=y_up @ poses[link])
+    for name, solid in solids_by_link(hand).items():
+        points, faces, normals = solid.vertices, solid.faces, solid.normals
+        shape = trimesh.Trimesh(points, faces, vertex_normals=normals, visual=_paint(solid.color), process=False)
+        scene.add_geometry(shape, geom_name=name, node_name=name, transform=y_up @ poses[solid.link])
     data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=_soften)
     assert isinstance(data, bytes)
     return write_file(path, data)

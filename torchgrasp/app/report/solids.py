@@ -43,6 +43,18 @@ def solids_of_links(hand: Hand) -> list[Solid]:
     ]
 
 
+def solids_by_link(hand: Hand) -> dict[str, Solid]:
+    """Return by link name the collision shapes of each link that has some, as one mesh in the frame of the link."""
+    found, solids = {}, solids_of_links(hand)
+    for link, name in enumerate(hand.tree.link_names):
+        if mine := [solid for solid in solids if solid.link == link]:
+            starts = np.cumsum([0, *(len(s.vertices) for s in mine)])
+            faces = np.concatenate([s.faces + start for s, start in zip(mine, starts, strict=False)])
+            points, normals = np.concatenate([s.vertices for s in mine]), np.concatenate([s.normals for s in mine])
+            found[name] = Solid(points, faces, normals, link, mine[0].finger)
+    return found
+
+
 def link_poses(
     hand: Hand, joints: Float[Tensor, "n j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "n 4 4"]
 ) -> Float[Tensor, "n l 4 4"]:

@@ -25,7 +25,7 @@ from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
 from torchgrasp.control.forces import squeeze
 from torchgrasp.files import write_file
-from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
@@ -147,6 +147,17 @@ def _surface(run: Run) -> dict[str, object]:
 def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
     """Return the table rows of grasps, their contacts, and all link poses in each of the `POSTURES`."""
     columns = (0, 1, 5, 3, 6)  # rank, success, margin, clearance and standard deviation
+    return {
+        "heads": [GRASP_COLUMNS[k] for k in columns],
+        "rows": [[row[k] for k in columns] for row in grasp_rows(grasps, MOST_GRASPS)],
+        "points": pack(to_array(grasps.contacts.points)),
+        "normals": pack(to_array(grasps.contacts.normals)),
+        "links": pack(to_array(pose_postures(hand, grasps))),
+    }
+
+
+def pose_postures(hand: Hand, grasps: Grasps) -> Float[Tensor, "g p l 4 4"]:
+    """Return the poses of all links in the object's frame, in each of the `POSTURES` of each grasp."""
     pose, opened = grasps.obj_from_hand.double(), grasps.pregrasp.double()
     raised = opened_pose(hand, opened, pose, grasps.table)
     away = raised.clone()
@@ -154,13 +165,7 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
     squeezed = squeeze(hand, grasps).joints if len(grasps) else opened
     motion = [(opened, away), (opened, raised), (grasps.joints.double(), pose), (squeezed, pose)]
     poses = [link_poses(hand, hand.expand_joints(q), hand.tree.joint_names, p) for q, p in motion]
-    return {
-        "heads": [GRASP_COLUMNS[k] for k in columns],
-        "rows": [[row[k] for k in columns] for row in grasp_rows(grasps, MOST_GRASPS)],
-        "points": pack(to_array(grasps.contacts.points)),
-        "normals": pack(to_array(grasps.contacts.normals)),
-        "links": pack(to_array(torch.stack(poses, 1))),
-    }
+    return torch.stack(poses, 1)
 
 
 def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
@@ -177,7 +182,7 @@ def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
         "story": describe_film(run.mesh, run.hand, closure),
         "moments": moments,
         "touches": pack(to_array(apply(hand_pose, trace.points[ticks].double()))),
-        "pushes": pack(to_array(trace.forces[ticks].double() @ hand_pose[:, :3, :3].mT)),
+        "pushes": pack(to_array(rotate(hand_pose, trace.forces[ticks].double()))),
         "points": pack(np.asarray(run.mesh.vertices)[kept]),
         "faces": pack(faces, "u4"),
         "ticks": pack(ticks, "u4"),
