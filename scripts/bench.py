@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-close  misplaced, sensors, perturb, table-lift, holding, play, speed, success: closing, lifting, exported folders
+close  misplaced, sensors, perturb, table-lift, holding, play, speed, success, arm: closing, lifting, exported folders
 gpu    kernels, clouds, launches, pulls: kernels beside the CPU; many clouds and trials at once; launches, without a GPU
 hand   fk, collision, codes, em: kinematics beside pytorch-kinematics, self-collision, inverse kinematics, learning
 load   plans, trials, points, starts, campaign, scheduler, waiting: memory over many plans and trials, of large inputs;

@@ -1,8 +1,8 @@
 """The UR5e with an Allegro hand, and grasps of the shipped cylinder that it reaches, each made once."""
 
 import pytest
+from benchmarks.ur5e import ur5e
 
-from tests.arm.ur5e import ur5e
 from tests.make import load_hand
 from torchgrasp import ContactSpec, load_object, plan_grasps
 

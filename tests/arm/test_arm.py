@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 import torch
+from benchmarks.ur5e import by_products, ur5e, ur5e_urdf
 
-from tests.arm.ur5e import by_products, ur5e, ur5e_urdf
 from tests.make import random_motion
 from torchgrasp.arm import load_arm
 from torchgrasp.arm.reach import measure_ease, reach_poses

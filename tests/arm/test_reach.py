@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 import torch
+from benchmarks.ur5e import ur5e
 
-from tests.arm.ur5e import ur5e
 from tests.make import distance_field, random_motion, real
 from torchgrasp import ContactSpec, Plane, Status, load_object, plan_grasps
 from torchgrasp.arm.reach import follow_grasps, way_of

@@ -30,7 +30,7 @@ def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor,
     reached = torch.zeros(len(obj_from_hand), dtype=torch.bool, device=target.device)
     for start in _nearest(arm, target, starts).unbind(1):
         left = torch.nonzero(~reached)[:, 0]
-        reached[left] = _solve(arm, arm.library[start[left]].T, target[..., left], 8, SOLVED)[1]
+        reached[left] = solve_tips(arm, arm.library[start[left]].T, target[..., left], 8, SOLVED)[1]
     return reached.to(obj_from_hand.device)
 
 
@@ -53,7 +53,7 @@ def follow_grasps(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld) -
     poses, starts, at = way_of(hand, grasps, world).to(arm.lower), 8, COARSE_STEPS + 1
     (g, w), tips = poses.shape[:2], arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
     near = _nearest(arm, tips[..., at], starts).flatten()
-    joints, solved = _solve(arm, arm.library[near].T, tips[..., at].repeat_interleave(starts, 2))
+    joints, solved = solve_tips(arm, arm.library[near].T, tips[..., at].repeat_interleave(starts, 2))
     solved &= in_chunks(lambda x: (_is_clear(arm, x[:, None], world),), joints.T, 256)[0]
     ease = torch.where(solved, measure_ease(arm, joints).prod(1), -1.0).view(g, starts)
     way, found, least = poses.new_zeros(g, w, len(joints)), solved.new_zeros(g), poses.new_zeros(g, 2)
@@ -91,7 +91,7 @@ def _track(
     speed, at = 0.1, COARSE_STEPS + 1
     path, steady = {at: start}, torch.ones_like(start[0], dtype=torch.bool)
     for k, last in [(k, k + 1) for k in reversed(range(at))] + [(k, k - 1) for k in range(at + 1, 2 * at)]:
-        path[k], solved = _solve(arm, path[last], tips[..., k], steps=4)
+        path[k], solved = solve_tips(arm, path[last], tips[..., k], steps=4)
         seconds = torch.linalg.vector_norm(tips[:, 3, :, k] - tips[:, 3, :, last], dim=0) / speed
         steady &= solved & ((path[k] - path[last]).abs() <= arm.speed[:, None] * seconds).all(0)
     return torch.stack([path[k].T for k in range(2 * at)], 1), steady
@@ -128,7 +128,7 @@ def _nearest(arm: Arm, target: Float[Tensor, "3 4 k"], count: int) -> Int[Tensor
     return in_chunks(find, features(target), 256)[0]
 
 
-def _solve(
+def solve_tips(
     arm: Arm, start: Float[Tensor, "n k"], target: Float[Tensor, "3 4 k"], steps: int = 12, solved: float = 1e-4
 ) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "k"]]:
     """Move postures within their limits until the tips are in place; return them, and whether each tip is.

@@ -30,6 +30,7 @@ from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.lazy import trimesh
 from torchgrasp.sim.convex_parts import read_solid
+from torchgrasp.sim.scene import Scene
 from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.specs import ClosingMode, TrialSpec
@@ -129,6 +130,10 @@ class TrialDriver:
             mesh, *parts = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
         return Body(mesh, parts, mass)
 
+    def _open_scene(self, spec: SceneSpec) -> Scene:
+        """Return a fresh scene of a run of the trial."""
+        return open_scene(spec, self.spec.simulator)
+
     def open(self) -> "TrialRun":
         """Return a run of the trial in a fresh scene; raises `MissingExtra` if the simulator is not installed."""
         return TrialRun(self)
@@ -169,7 +174,7 @@ class TrialRun:
         if trial.truth.camera is not None:
             self._relook(driver, trial.truth.camera)
         start = driver.scene_spec.world_from_hand[:3, :3] @ self.controller.targets.palm.numpy()
-        self.scene = open_scene(dataclasses.replace(driver.scene_spec, start=tuple(start.tolist())), spec.simulator)
+        self.scene = driver._open_scene(dataclasses.replace(driver.scene_spec, start=tuple(start.tolist())))
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
         self.overlap, self.slid = self.scene.penetration(), np.zeros(3)

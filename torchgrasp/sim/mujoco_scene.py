@@ -34,7 +34,7 @@ class MujocoScene(Scene):
     def __init__(self, spec: SceneSpec) -> None:
         super().__init__(spec)
         self._mujoco = mujoco = import_mujoco()
-        text = scene_mjcf(spec)
+        text = self._write(spec)
         try:
             self.model = model = mujoco.MjModel.from_xml_string(text)
         except ValueError as error:
@@ -53,6 +53,10 @@ class MujocoScene(Scene):
         parents = model.body_parentid.tolist()
         self._map_contacts([0], (parents[tip] if model.body_jntnum[tip] == 0 else None for tip in self.tips))
         self._begin()
+
+    def _write(self, spec: SceneSpec) -> str:
+        """Return the scene's model; a scene in which something else carries the hand returns another."""
+        return scene_mjcf(spec)
 
     def _begin(self) -> None:
         """Set joints and mount to the start, with their targets."""
