@@ -1,15 +1,17 @@
 """`torchgrasp hand`: a draft, every fault by name, a picture of a sound hand."""
 
+import importlib.util
 import io
 import re
 import shutil
+import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from torchgrasp.app.cli import main
-from torchgrasp.hand.load import hands_folder
+from torchgrasp.hand.load import hands_folder, load_hand
 
 
 @pytest.fixture
@@ -160,3 +162,47 @@ def test_train_learns_a_mixture_that_the_paper_modes_take(claw, capsys):
     assert load_mixture(folder).joint_names == load_hand(folder).joint_names
     assert main(["hand", "train", folder, "--held-out", "1"]) == 2
     assert main(["hand", "train", folder, "--out", "x.pt"]) == 2
+
+
+@pytest.fixture
+def described(barrett, tmp_path, monkeypatch):
+    """A stand-in for the package robot_descriptions, with one hand."""
+    package = tmp_path / "path" / "robot_descriptions"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    here = f"REPOSITORY_PATH = {str(barrett)!r}\n"
+    urdf = f"URDF_PATH = URDF_PATH_LEFT = {str(barrett / 'hand.urdf')!r}\n"
+    (package / "claw_description.py").write_text(here + urdf)
+    (package / "scene_description.py").write_text(here + "MJCF_PATH = 'x.xml'\n")
+    (package / "far_description.py").write_text("raise OSError('no route to host')")
+    monkeypatch.syspath_prepend(package.parent)
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    for name in [name for name in sys.modules if name.split(".")[0] == "robot_descriptions"]:
+        del sys.modules[name]
+
+
+@pytest.mark.parametrize("name", ["claw", "claw_description"])
+def test_new_takes_the_name_of_a_description(described, capsys, name):
+    assert main(["hand", "new", name]) == 0
+    said = capsys.readouterr().out
+    assert f"written: {name}/hand.toml" in said and f"{name} also has URDF_PATH_LEFT: " in said
+    assert load_hand(described / name).dof == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("octopus", "allegro_hand"), ("scene", "without a URDF"), ("far", "no route to host.*"), ("none.urdf", "no file")],
+)
+def test_new_names_what_is_wrong_with_a_description(described, capsys, name, words):
+    assert main(["hand", "new", name]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("torchgrasp") or "URDF" in said or "urdf" in said
+    assert re.search(words, said) and not (described / name).exists()
+
+
+def test_new_without_robot_descriptions_names_the_extra(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert main(["hand", "new", "allegro_hand"]) == 2
+    assert "pip install 'torchgrasp[robots]'" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from torchgrasp.errors import HandFileError
-from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.hand.urdf import read_published, read_urdf
 from torchgrasp.limits import URDF_BYTES
 
 LINKS = '<link name="a"/><link name="b"/>'
@@ -98,7 +98,24 @@ HOSTILE = {
     "axis that hides a ratio": (GOOD.replace('"0 0 1"', '"0 0 0.333"'), "axis"),
     "nan limit": (GOOD.replace('lower="-1"', 'lower="nan"'), "lower"),
     "infinite limit": (GOOD.replace('upper="1"', 'upper="inf"'), "upper"),
-    "inverted limits": (GOOD.replace('lower="-1"', 'lower="2"'), "lower < upper"),
+    "swapped limits": (GOOD.replace('lower="-1"', 'lower="2"'), "lower < upper: are they swapped"),
+    "limits in degrees": (GOOD.replace('lower="-1" upper="1"', 'lower="-29" upper="108"'), "in degrees"),
+    "limits in millimetres": (
+        GOOD.replace("revolute", "prismatic").replace('upper="1"', 'upper="40"'), "in millimetres"),
+    "a lower limit alone": (GOOD.replace('upper="1" ', ""), "both limits, or none"),
+    "an upper limit alone": (GOOD.replace('lower="-1" ', ""), "both limits, or none"),
+    "angles in degrees": (GOOD.replace("<axis", '<origin rpy="0 90 0"/><axis'), "radians .in degrees. 90 is 1.57 rad"),
+    "xacro variable": (GOOD.replace('upper="1"', 'upper="${pi/2}"'), "without xacro .*pi/2"),
+    "xacro argument": (GOOD.replace('name="j"', 'name="$(arg prefix)j"'), "without xacro .*arg prefix"),
+    "xacro tag": (GOOD.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"').replace(
+        "</robot>", '<xacro:finger side="left"/></robot>'), "without xacro .*xacro:finger"),
+    "xacro tag in a link": (GOOD.replace("<robot", '<robot xmlns:xacro="http://ros.org/wiki/xacro"').replace(
+        '<link name="a"/>', '<link name="a"><xacro:inertia/></link>'), "link a 'xacro:inertia"),
+    "xacro tag without its name": (GOOD.replace("</robot>", "<xacro:finger/></robot>"), "without xacro"),
+    "xacro find": (GOOD.replace('<link name="a"/>', '<link name="a"><collision><geometry>'
+                                '<mesh filename="$(find h)/x.stl"/></geometry></collision></link>'), "xacro .*find h"),
+    "two scales": (GOOD.replace('<link name="a"/>', '<link name="a"><collision><geometry>'
+                                '<mesh filename="x.stl" scale="1 1"/></geometry></collision></link>'), "3 finite"),
     "no limits": (re.sub("<limit[^>]*>", "", GOOD), "limit"),
     "nan origin": (GOOD.replace("<axis", '<origin xyz="nan 0 0"/><axis'), "origin"),
     "two numbers": (GOOD.replace("<axis", '<origin xyz="0 0"/><axis'), "3 finite"),
@@ -159,3 +176,15 @@ def test_angles_come_back_as_they_stand_in_the_file(tmp_path, rpy):
     found = Rotation.from_euler("xyz", read_urdf(write(tmp_path, text)).joints[0].rpy)
     truth = Rotation.from_euler("xyz", [float(x) for x in rpy.split()])
     assert (found.inv() * truth).magnitude() < 1e-14
+
+
+def test_a_scale_of_one_number_counts_for_all_axes(tmp_path):
+    mesh = '<collision><geometry><mesh filename="x.stl" scale="0.001"/></geometry></collision>'
+    urdf = read_published(write(tmp_path, GOOD.replace('<link name="a"/>', f'<link name="a">{mesh}</link>')))
+    assert urdf.links[0].shapes[0].size == (0.001,) * 3
+
+
+def test_a_full_turn_either_way_is_read(tmp_path):
+    """As the joints of many arms have it."""
+    urdf = read_urdf(write(tmp_path, GOOD.replace('"-1" upper="1"', '"-6.28319" upper="6.28319"')))
+    assert urdf.joints[0].upper == 6.28319

@@ -30,6 +30,8 @@ PARTS = {
 """The elements that are read, by the element around them. `<visual>` is left out, with its mesh."""
 REQUIRED = {"inertial": ("mass", "inertia"), "collision": ("geometry",), "joint": ("parent", "child")}
 """Elements that an element must have."""
+DEGREES = "(in degrees? 90 is 1.57 rad)"
+NO_XACRO = "a URDF without xacro (xacro FILE > hand.urdf)"
 WORDS = {
     **{"link": ("name",), "joint": ("name", "type"), "mesh": ("filename",)},
     **{"parent": ("link",), "child": ("link",), "mimic": ("joint",)},
@@ -50,7 +52,7 @@ NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
 """Attributes that are numbers: their count and default. None marks a required one, "" one that may be omitted."""
 
 
-class _BoundedBuilder(ET.TreeBuilder):
+class BoundedBuilder(ET.TreeBuilder):
     """An XML tree builder that rejects too many elements and too deep nesting."""
 
     def __init__(self) -> None:
@@ -58,6 +60,7 @@ class _BoundedBuilder(ET.TreeBuilder):
         self.depth = self.count = 0
 
     def start(self, tag: Any, attrs: Any) -> Any:
+        """Count an element, and raise `HandFileError` for one too many."""
         self.depth, self.count = self.depth + 1, self.count + 1
         if self.depth > XML_DEPTH or self.count > XML_ELEMENTS:
             allowed = f"at most {XML_ELEMENTS} elements, nested at most {XML_DEPTH} deep"
@@ -65,6 +68,7 @@ class _BoundedBuilder(ET.TreeBuilder):
         return super().start(tag, attrs)
 
     def end(self, tag: Any) -> Any:
+        """Leave an element."""
         self.depth -= 1
         return super().end(tag)
 
@@ -82,15 +86,15 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
     if "\0" in text or (declared and declared.group(1).lower() not in ("utf-8", "us-ascii", "ascii")):
         raise HandFileError("urdf", f"{path} in another encoding", "UTF-8 text")
     try:
-        robot = ET.fromstring(data, ET.XMLParser(target=_BoundedBuilder()))
+        robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
     except (ET.ParseError, ValueError) as error:
         if isinstance(error, HandFileError):
             raise
-        raise HandFileError("urdf", f"{path}: {error}", "well-formed XML") from error
+        raise HandFileError("urdf", f"{path}: {error}", NO_XACRO if "xacro:" in text else "well-formed XML") from error
     if robot.tag != "robot":
         raise HandFileError("urdf", f"{path}: <{robot.tag}>", "<robot> as the root element")
     for element in robot:
-        if element.tag not in {"link", "joint"} | IGNORED:
+        if element.tag not in {"link", "joint"} | IGNORED and "xacro}" not in element.tag:  # named below
             raise HandFileError("urdf", f"{path}: <{element.tag}>", f"<link>, <joint> or one of {sorted(IGNORED)}")
     clean = _clean(path, "", robot)
     clean.set("name", robot.get("name") or "hand")
@@ -102,6 +106,12 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
     tag = str(element.tag)
     clean = ET.Element(tag)
     where = "" if tag == "robot" else f"{where} {tag} {(element.get('name') or '')[:XML_LETTERS]}".strip()
+    read = [element.get(key, "") for key in (*WORDS.get(tag, ()), *NUMBERS.get(tag, {}))]
+    left = [x for x in read if "${" in x or "$(" in x] + [
+        f"xacro:{str(part.tag).rpartition('}')[2]}" for part in element if "xacro}" in str(part.tag)
+    ]
+    if left:
+        raise HandFileError("urdf", f"{path}: {where} {left[0][:80]!r}", NO_XACRO)
     for key in WORDS.get(tag, ()):
         word = element.get(key, "")
         if not 0 < len(word) <= XML_LETTERS or not word.isprintable():
@@ -112,7 +122,10 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
     for key, (count, default) in NUMBERS.get(tag, {}).items():
         text = element.get(key, default)
         words = (text or "").split()
+        words *= 3 if tag == "mesh" and len(words) == 1 else 1  # one scale for all axes
         right = len(words) == count and all(NUMBER.fullmatch(w) and math.isfinite(float(w)) for w in words)
+        if right and key == "rpy" and any(abs(float(w)) > 6.3 for w in words):  # over a full turn
+            raise HandFileError("urdf", f"{path}: {where} rpy {text!r}", f"radians {DEGREES}")
         if right:
             clean.set(key, " ".join("0" if float(w) == 0 else w for w in words))  # no negative zero
         elif text != "" or key in element.attrib:

@@ -17,7 +17,7 @@ import numpy as np
 from torchgrasp.checks import checked
 from torchgrasp.errors import HandFileError
 from torchgrasp.files import read_bounded
-from torchgrasp.hand.safe_xml import SIZES, parse_urdf
+from torchgrasp.hand.safe_xml import DEGREES, SIZES, parse_urdf
 from torchgrasp.lazy import yourdfpy
 from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
@@ -242,8 +242,16 @@ def _check_joints(urdf: Urdf) -> None:
             raise urdf.wrong(f"joint {j.name} of type {j.kind!r}", "revolute, prismatic, continuous or fixed")
         if not _is_unit(math.hypot(*j.axis)):
             raise urdf.wrong(f"joint {j.name} with an axis of length {math.hypot(*j.axis):g}", "a unit axis")
+        limits = f"joint {j.name} with limits {j.lower:g}, {j.upper:g}"
         if not j.lower < j.upper:
-            raise urdf.wrong(f"joint {j.name} with limits {j.lower}, {j.upper}", "limits with lower < upper")
+            swapped = ": are they swapped?" * (j.lower > j.upper)
+            raise urdf.wrong(limits, f"limits with lower < upper{swapped}")
+        if math.isinf(j.lower) != math.isinf(j.upper):
+            raise urdf.wrong(limits, "both limits, or none (ROS takes 0 for the missing one)")
+        if j.kind == "revolute" and math.isfinite(j.lower) and max(-j.lower, j.upper) > 6.3:  # over a full turn
+            raise urdf.wrong(limits, f"radians, at most a full turn either way {DEGREES}")
+        if j.kind == "prismatic" and math.isfinite(j.lower) and max(-j.lower, j.upper) > MAX_EXTENT:
+            raise urdf.wrong(limits, f"at most {MAX_EXTENT:g} m either way (in millimetres?)")
         passed = [j.name]
         while mimic := movable[passed[-1]].mimic:
             follower = f"joint {passed[-1]} that follows"

@@ -236,6 +236,11 @@ ELSEWHERE = [
     "../secret.stl", "/etc/secret.stl", "file:///etc/secret.stl", "http://localhost/x.stl", "package://../secret.stl",
     "package://claw/../../secret.stl", "a\\..\\x.stl", "x.dae", "none.stl", "package://", "link.stl", "folder.stl",
 ]  # fmt: skip
+WHY = {
+    "none.stl": "missing", "package://claw/none.stl": "missing", "Box.STL": "called box.stl there", "x.fbx": "format",
+    "package://claw/Box.stl": "called box.stl there", "/etc/box.stl": "absolute", "file:///box.stl": "address",
+    "a\\box.stl": "slashes", "../secret.stl": "outside", "link.stl": "symbolic link", "large.stl": "more than 50 MiB",
+}  # fmt: skip
 BROKEN = {
     "empty": (b"", "stl"),
     "words": (b"solid x\nhello\n", "stl"),
@@ -258,6 +263,19 @@ def test_a_mesh_that_is_broken_or_elsewhere_is_refused_by_name(claw, name):
     (claw.parent / f"tip.{kind}").write_bytes(data)
     change(claw, ('<sphere radius="0.011"/>', f'<mesh filename="{f"tip.{kind}" if kind else name}"/>'))
     with pytest.raises(HandFileError, match="mesh"):
+        new_hand(claw)
+
+
+@pytest.mark.parametrize("name", WHY)
+def test_a_refused_mesh_says_why(claw, name):
+    box = trimesh.creation.box().export(file_type="stl")
+    for file in (claw.parent / "box.stl", claw.parent.parent / "secret.stl"):
+        file.write_bytes(box)
+    (claw.parent / "link.stl").symlink_to(claw.parent.parent / "secret.stl")
+    with (claw.parent / "large.stl").open("wb") as file:
+        file.truncate(51 * 2**20)
+    change(claw, ('<sphere radius="0.011"/>', f'<mesh filename="{name}"/>'))
+    with pytest.raises(HandFileError, match=f"mesh .*{WHY[name]}|{WHY[name]}.*mesh"):
         new_hand(claw)
 
 

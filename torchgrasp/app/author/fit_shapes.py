@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from torchgrasp.app.author.repair import place, pose_of
-from torchgrasp.errors import HandFileError
+from torchgrasp.app.author.scene_meshes import check_glb, clean_dae
+from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.files import explain, read_bounded
 from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.hand.hand_toml import Pad
@@ -21,7 +22,7 @@ from torchgrasp.hand.urdf import Shape, Urdf
 from torchgrasp.lazy import trimesh
 from torchgrasp.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACES
 
-MESH_KINDS = (".stl", ".obj", ".ply")  # formats of meshes that contain only geometry
+MESH_KINDS = (".stl", ".obj", ".ply", ".dae", ".glb")
 SAVING, SAVING_TIP = 0.12, 0.04
 """A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of all boxes."""
 Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
@@ -29,24 +30,34 @@ Corners = tuple[np.ndarray, np.ndarray]
 
 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
-    """Return the path of a mesh that a URDF names, also by `package://`; raise `HandFileError` if `folder` lacks it."""
-    base, kinds = folder.resolve(), ", ".join(MESH_KINDS)
-    refusal = urdf.wrong(f"mesh {name[:80]!r}", f"a mesh ({kinds}) of at most {MESH_BYTES >> 20} MiB inside {folder}")
-    package = name.startswith("package://")
+    """Return the path of a mesh that a URDF names, also by `package://`; raise `HandFileError`, which says why not."""
+    base, here, called = folder.resolve(), urdf.path.resolve().parent, f"mesh {name[:80]!r}"
     path = PurePosixPath(name.removeprefix("package://"))
-    if ":" in str(path) or "\\" in name or path.is_absolute() or path.suffix.lower() not in MESH_KINDS:
-        raise refusal
+    if ":" in str(path) or "\\" in name or path.is_absolute():
+        raise urdf.wrong(
+            f"{called}, an absolute path or an address", f"a path inside {folder} with slashes, as a/b.stl"
+        )
+    if path.suffix.lower() not in MESH_KINDS:
+        raise urdf.wrong(f"{called} of another format", f"a mesh ({', '.join(MESH_KINDS)})")
     # the files of a package may lie anywhere in the folder: the first parts of the path may be left out
-    starts = range(len(path.parts) if package else 1)
-    places = [place.joinpath(*path.parts[k:]) for k in starts for place in (urdf.path.resolve().parent, base)]
-    for file in places:
+    package = name.startswith("package://")
+    roots = (here, *(x for x in here.parents if package and x.is_relative_to(base)), base)
+    places, why = [x.joinpath(*path.parts[k:]) for k in range(len(path.parts) if package else 1) for x in roots], ""
+    for spot in places:
         try:
-            found = file.resolve()
-            if found.is_relative_to(base) and found.is_file() and found.stat().st_size <= MESH_BYTES:
-                return found
-        except (OSError, RuntimeError, ValueError):  # a loop of links, or a name that the file system refuses
+            file = spot.resolve()
+            if not file.is_relative_to(base):
+                why = why or "outside, perhaps by a symbolic link"
+            elif file.is_file() and file.stat().st_size > MESH_BYTES:
+                why = why or f"of {file.stat().st_size} bytes, more than {MESH_BYTES >> 20} MiB"
+            elif file.is_file():
+                return file
+            else:
+                alike = [x.name for x in file.parent.iterdir() if x.name.lower() == file.name.lower()]
+                why = why or (f"called {alike[0]} there" if alike and alike[0] != file.name else "")
+        except (OSError, RuntimeError, ValueError):  # no such folder, a loop of links, or a name that no system takes
             continue
-    raise refusal
+    raise urdf.wrong(f"{called}, {why or 'missing'}", f"a file inside {folder} (--meshes names another folder)")
 
 
 def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
@@ -104,14 +115,21 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     path = mesh_file(urdf, name, folder)
     data = read_bounded(path, MESH_BYTES, "a mesh", functools.partial(HandFileError, "urdf"))
     allowed = f"a triangle mesh of at most {MESH_FACES} faces"
+    suffix, scale = path.suffix.lower(), 1.0
     try:
-        mesh = load_triangles(data, path.suffix.lower(), process=False)
+        if suffix == ".dae":
+            data, scale = clean_dae(data)
+        elif suffix == ".glb":
+            check_glb(data)
+        mesh = load_triangles(data, suffix, process=False, ignore_broken=False)
+    except MissingExtra:
+        raise
     except Exception as error:  # the readers of trimesh raise errors of many kinds
         raise urdf.wrong(f"mesh {name!r}: {explain(error)}", allowed) from error
     sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MESH_FACES
     if not sound or not np.isfinite(mesh.vertices).all():
         raise urdf.wrong(f"mesh {name!r} without faces, or with vertices that are not finite", allowed)
-    return _sample(mesh)
+    return scale * _sample(mesh)
 
 
 def _primitive_points(shape: Shape) -> Points:

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from torchgrasp.app.author.draft import Wish, new_hand
 from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, option, positional, required
+from torchgrasp.app.cli.described import locate_urdf
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, check_folder, holding, load_fingers
 from torchgrasp.app.report.stills import draw_hand, opposed_posture
 from torchgrasp.base import count_status
@@ -29,7 +30,6 @@ from torchgrasp.posture_model.sample import SampleSpec, Sampling, can_close, sam
 from torchgrasp.posture_model.score import evaluate_mixture, growing_bic
 from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
-STARTS = 5  # starts of k-means, as for the shipped models
 TRIAL_STARTS = 100  # initial guesses with which a hand is tried on a shipped object
 
 
@@ -37,7 +37,7 @@ TRIAL_STARTS = 100  # initial guesses with which a hand is tried on a shipped ob
 class HandNew(Command):
     """Write a first hand.toml for a published URDF, and a clean copy of the URDF where it needs repair."""
 
-    urdf: Path = positional("the hand, with or without meshes")
+    urdf: Path = positional("file of the hand, with or without meshes, or its name in robot_descriptions")
     tips: tuple[str, ...] = option(
         (),
         'links of three to five fingertips in grasp order, first the three of option "default"; "four" and "five" add '
@@ -51,21 +51,22 @@ class HandNew(Command):
 
     def run(self) -> int:
         """Draft, check and write the files of the hand; return the exit code."""
-        folder = self.urdf.parent if self.out is None else self.out
+        urdf, meshes, out = locate_urdf(self.urdf, self.meshes, self.out)
+        folder = urdf.parent if out is None else out
         check_folder(folder)
-        clean = "hand.urdf" if (folder / "hand.urdf").resolve() != self.urdf.resolve() else "hand_clean.urdf"
-        draft = new_hand(self.urdf, Wish(self.tips, self.name or "", self.root, self.meshes), self.seed, clean)
+        clean = "hand.urdf" if (folder / "hand.urdf").resolve() != urdf.resolve() else "hand_clean.urdf"
+        draft = new_hand(urdf, Wish(self.tips, self.name or "", self.root, meshes), self.seed, clean)
         texts = {"hand.toml": draft.toml}
-        if draft.urdf or self.out is not None:
-            texts[clean if draft.urdf else self.urdf.name] = draft.urdf or self.urdf.read_text(encoding="utf-8")
+        if draft.urdf or out is not None:
+            texts[clean if draft.urdf else urdf.name] = draft.urdf or urdf.read_text(encoding="utf-8")
         for file in texts:
             if (folder / file).exists():
                 raise OutputError("URDF", f"{folder / file}, which exists", "a folder without this file, as by --out")
         with temporary_folder() as trial:
-            for file, text in ({self.urdf.name: self.urdf.read_text(encoding="utf-8")} | texts).items():
+            for file, text in ({urdf.name: urdf.read_text(encoding="utf-8")} | texts).items():
                 write_file(trial / file, text)
             if print_faults(trial):
-                print(f"nothing is written; repair {self.urdf} and try again")
+                print(f"nothing is written; repair {urdf} and try again")
                 return 2
             hand = check_hand(trial)
             sets = describe_sets(hand)
@@ -263,17 +264,16 @@ class HandTrain(Command):
             print(f"{hand.name}: {len(samples)} postures in {time.perf_counter() - begin:.0f} s")
             begin = time.perf_counter()
             components = self.components or choose_components(hand, self.seed, self.workers)
-            first = 300  # postures of a Gaussian on the smallest subset: with fewer, starts settle on chance
             with make_bar(None, "step", desc="EM") as bar, naming(path="--checkpoint"):
 
                 def show(progress: Progress) -> None:
                     bar.update()
                     bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
 
-                # The tolerance is the mean log-likelihood [nats] that a step must gain.
+                # The tolerance is a mean log-likelihood [nats]. With fewer postures a Gaussian starts by chance.
                 mixture = fit_mixture(
-                    samples[: self.n], components, self.seed, tolerance=1e-3, starts=STARTS,
-                    subset=first * components, checkpoint=self.checkpoint, observer=show,
+                    samples[: self.n], components, self.seed, tolerance=1e-3, starts=5,
+                    subset=300 * components, checkpoint=self.checkpoint, observer=show,
                 )  # fmt: skip
             meta, spent = mixture.meta, time.perf_counter() - begin
             print(
