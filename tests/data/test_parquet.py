@@ -1,5 +1,6 @@
 """A data set as Parquet: other libraries read offline what our own reader reads."""
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from tests.data.others import ROOT, read_foreign
 from tests.make import load_hand
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.data import GraspShards, read_shards, write_parquet
-from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
+from torchgrasp.errors import BadArgument, MissingExtra, ModelFileError, OutputError, Status
 from torchgrasp.geometry.frames import apply
 
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -119,11 +120,16 @@ def test_an_export_that_was_broken_off_goes_on_and_others_are_refused(
         write_parquet(shards, tmp_path / "mine")
 
 
-def test_no_grasps_and_no_pyarrow_are_told(tmp_path: Path, shards: GraspShards, monkeypatch: pytest.MonkeyPatch):
+def test_no_grasps_other_cards_and_no_pyarrow_are_told(
+    tmp_path: Path, shards: GraspShards, monkeypatch: pytest.MonkeyPatch
+):
     asked = campaign(1)
     carry_out(asked, tmp_path / "none", work_on(asked, 0))
     with pytest.raises(BadArgument, match="without a grasp"):
         write_parquet(read_shards(tmp_path / "none"), tmp_path / "out")
+    for change in ({"asked": {}}, {"asked": 3}, {"counts": {}}, {"counts": {"status": {"FINE": 1}}}):
+        with pytest.raises(ModelFileError, match=r"card\.json"):
+            write_parquet(dataclasses.replace(shards, card=shards.card | change), tmp_path / "out")
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     with pytest.raises(MissingExtra, match=r"torchgrasp\[data\]"):
         write_parquet(shards, tmp_path / "out")

@@ -9,9 +9,10 @@ from typing import Any
 import torch
 
 from torchgrasp.checks import checked
-from torchgrasp.data.reader import GraspShards
+from torchgrasp.data.reader import CARD, GraspShards
 from torchgrasp.data.tables import as_column, as_table, import_arrow, pack_table, render_card, write_folder
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.errors import BadArgument, ModelFileError, Status
+from torchgrasp.lazy import jinja2
 
 
 @checked
@@ -22,8 +23,8 @@ def write_parquet(data: GraspShards, folder: Path | str) -> Path:
     object, view, hand, friction, seed and the status of each try. `load_dataset(folder, "views")` reads a row for each
     job: its cloud and counts. The joints' names are in the cards, and in the metadata of each file's schema.
 
-    Raises `BadArgument` for no grasps, `ModelFileError` for a damaged shard, `OutputError` if the folder holds other
-    files or cannot be written, `MissingExtra` without pyarrow.
+    Raises `BadArgument` for no grasps, `ModelFileError` for a damaged shard or card, `OutputError` if the folder holds
+    other files or cannot be written, `MissingExtra` without pyarrow.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand
@@ -41,17 +42,27 @@ def write_parquet(data: GraspShards, folder: Path | str) -> Path:
     import_arrow()
     if not len(data):
         raise BadArgument("data", f"{len(data.jobs)} jobs without a grasp", "a data set with grasps")
-    source = {name: data.card[name] for name in ("campaign", "licence", "asked")}
-    return write_folder(folder, source, _files(data))
+    try:
+        source = {name: data.card[name] for name in ("campaign", "licence", "asked")}
+        asked, trial = source["asked"], source["asked"]["protocol"]["trial"]
+        of_campaign = {name: asked[name]["name"] for name in ("hand", "protocol")}
+        of_campaign |= {"simulator": trial["simulator"], "friction": trial["friction"], "seed": asked["trials"]["seed"]}
+        render_card("shards.md", card=data.card)
+    except (LookupError, TypeError, jinja2.TemplateError) as error:
+        raise ModelFileError("data", f"{data.folder / CARD} ({error})", "the card of `torchgrasp campaign`") from error
+    return write_folder(folder, source, _files(data, of_campaign))
 
 
-def _files(data: GraspShards) -> Iterator[tuple[str, str | bytes]]:
+def _files(data: GraspShards, of_campaign: dict[str, Any]) -> Iterator[tuple[str, str | bytes]]:
     """Yield names and contents of the files: for each shard its tables, at the end the cards."""
     schemas: dict[str, Any] = {}
     meta = {"torchgrasp": json.dumps(data.card["asked"]["hand"])}
     for k, first in enumerate(range(0, len(data.jobs), data.size)):
         jobs = range(first, min(first + data.size, len(data.jobs)))
-        for name, columns in (("views", _view_columns(data, jobs)), ("grasps", _grasp_columns(data, jobs))):
+        for name, columns in (
+            ("views", _view_columns(data, jobs)),
+            ("grasps", _grasp_columns(data, jobs, of_campaign)),
+        ):
             if columns:
                 table = as_table(columns, meta)
                 schemas[name] = [_describe(field) for field in table.schema]
@@ -61,17 +72,12 @@ def _files(data: GraspShards) -> Iterator[tuple[str, str | bytes]]:
     yield "croissant.json", render_card("croissant.json", card=data.card, tables=tables)
 
 
-def _grasp_columns(data: GraspShards, jobs: range) -> dict[str, Any]:
+def _grasp_columns(data: GraspShards, jobs: range, of_campaign: dict[str, Any]) -> dict[str, Any]:
     """Return the columns of the grasps of some jobs by name, or none if the jobs have no grasp."""
     numbers = range(data.starts[jobs.start], data.starts[jobs.stop])
-    items, asked = [data[i] for i in numbers], data.card["asked"]
+    items = [data[i] for i in numbers]
     of = [int(item["job"]) for item in items]
     tries = itertools.chain(*(data.job(j).outcome.tolist() for j in jobs))
-    of_campaign = {
-        "hand": asked["hand"]["name"], "protocol": asked["protocol"]["name"],
-        "simulator": asked["protocol"]["trial"]["simulator"], "friction": asked["protocol"]["trial"]["friction"],
-        "seed": asked["trials"]["seed"],
-    }  # fmt: skip
     of_view = "job", "points", "viewpoint"
     return {} if not items else {
         "grasp": list(numbers), "job": of,

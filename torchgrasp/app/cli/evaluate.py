@@ -200,12 +200,12 @@ class Campaign(_Trials):
                 bar.update()
 
             data = run_campaign(self.objects, hand, self.out, spec, source, show)
-        if self.parquet is not None:
-            with naming(folder="--parquet", path="--parquet", data="OBJECTS"):
-                write_parquet(data, self.parquet)
         counts = data.card["counts"]
         print(f"{counts['jobs']} jobs: {', '.join(f'{n} {name.lower()}' for name, n in counts['status'].items())}")
         print(f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {self.out}")
+        if self.parquet is not None:
+            with naming(folder="--parquet", path="--parquet", data="OBJECTS"):
+                write_parquet(data, self.parquet)
         failed = [row for row in data.jobs if row.status in FAILED]
         if failed:
             reasons = ", ".join(sorted({row.status.name.lower() for row in failed}))
