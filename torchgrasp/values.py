@@ -162,6 +162,10 @@ class Certificate(Batch):
     is the smallest over the largest singular value of W. `residual` is the largest |W phi|. `closed`, which means force
     closure, needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13) too. `witness` is
     a unit wrench w with w . v >= -margin for every column v of W. Without force closure no contact force opposes w.
+
+    With `resist`, contacts resist `task_margin` times the `task_load` t, of the task's wrenches [N, N m] the worst,
+    about their centroid. `task_forces` [N], of normal forces up to `task_strength` [N], balance so much of it.
+    `task_twist` y with y . t = -1 proves that no such forces balance more: none have a greater power along y.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -169,6 +173,11 @@ class Certificate(Batch):
     residual: Annotated[Float[Tensor, "b"], ANY]
     closed: Bool[Tensor, "b"]
     witness: Annotated[Float[Tensor, "b 6"], ANY]
+    task_margin: Annotated[Float[Tensor, "b"], ANY] | None = None
+    task_load: Annotated[Float[Tensor, "b 6"], ANY] | None = None
+    task_twist: Annotated[Float[Tensor, "b 6"], ANY] | None = None
+    task_forces: Annotated[Float[Tensor, "b f 3"], ANY] | None = None
+    task_strength: Annotated[Float[Tensor, "b f"], ANY] | None = None
 
 
 @checked

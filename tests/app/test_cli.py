@@ -81,15 +81,16 @@ def test_grasp_refuses_bad_input_in_one_sentence_and_leaves_nothing(tmp_path, re
 
 
 def test_regions_of_the_command_line_reach_the_planner(monkeypatch, run_command, tmp_path):
-    def see(*args, keep, avoid, **options):
+    def see(*args, keep, avoid, resist, **options):
+        assert resist == ("lift", "pour")
         points = torch.tensor([[0.0, 0.0, 0.04], [0.0, 0.0, 0.06]])
         assert (keep(points) < 0).tolist() == [False, True]
         assert (avoid(points) < 0).tolist() == [True, True]
         raise MissingExtra("seen", "seen")
 
     monkeypatch.setattr(grasps, "plan_grasps", see)
-    words = "--hand", "barrett", "--keep", "-1 -1 0.05 1 1 1", "--avoid", MESH, "--out", tmp_path / "out"
-    assert "seen" in run_command("grasp", VIEW, *words)[2]
+    words = "--hand", "barrett", "--keep", "-1 -1 0.05 1 1 1", "--avoid", MESH
+    assert "seen" in run_command("grasp", VIEW, *words, "--resist", "lift", "pour", "--out", tmp_path / "out")[2]
 
 
 @pytest.mark.parametrize("name", ["a" * 300, "a/" * 3000, "a\0b", "\ud800"])

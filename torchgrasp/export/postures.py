@@ -35,6 +35,8 @@ CONVENTIONS = {
     "force": "of the fingertip on the object at its contact, in the object's frame",
 }
 """Meaning of the numbers in a JSON file of grasps; the file contains this text."""
+TASK = "task_margin", "task_load", "task_twist", "task_forces", "task_strength"
+"""Fields of the `Certificate`, which explains them, that stand in the file if grasps were planned with `resist`."""
 
 
 @checked
@@ -88,6 +90,7 @@ def format_grasps(
             ],
             "clearance": float(grasps.clearance[row]),
             "closure_margin": float(grasps.certificate.margin[row]),
+            **{name: x[row].tolist() for name, x in vars(grasps.certificate).items() if x is not None and name in TASK},
         }
         for row, pose in enumerate(grasps.obj_from_hand)
     ]

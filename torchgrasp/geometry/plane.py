@@ -21,7 +21,7 @@ from torchgrasp.geometry.linalg import unit
 GRID = 2.0**-20  # spacing [m] of rounded points: far above the rounding errors of a transform
 POINTS, DIRECTIONS, POSES = (
     ("points", "viewpoint", "vertices"),
-    ("normals", "approach", "witness", "frustum"),
+    ("normals", "approach", "witness", "frustum", "task_load", "task_twist", "task_forces"),
     ("obj_from_hand", "obj_from_vf"),
 )
 """Names of the fields that change with the coordinate frame, by kind; all other fields are invariant."""

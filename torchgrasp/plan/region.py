@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.base import Value
-from torchgrasp.checks import Fraction, Pose, checked
+from torchgrasp.checks import Fraction, Pose, checked, show
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.mesh import read_mesh
@@ -22,43 +22,35 @@ from torchgrasp.scene.scene import Scene
 from torchgrasp.values import PointCloud
 
 Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
-"""Function that returns the signed distance [m] of points (n, 3) [m] in float64: negative inside a region."""
+"""Function that returns the signed distance [m] of points (n, 3) [m]: negative inside a region."""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Region(Value):
-    """A region of space, in the frame of the cloud; its `distance` is a function of points, which need not be smooth.
+    """A region of space in the frame of the cloud; `distance` is any function of points (n, 3) in float64.
 
-    A call returns the signed distance [m] of points, negative inside. It raises `BadArgument` if the function returns
-    anything but one finite number for each point.
-
-    >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)
-    >>> ball(torch.tensor([[0.0, 0.0, 0.06]])).round(decimals=3)
-    tensor([0.0100])
+    >>> from torchgrasp import load_object
+    >>> ball, rim = Region(lambda points: points.norm(dim=-1) - 0.05), Region.rim(load_object("jug").view, table=0.0)
+    >>> ball(torch.tensor([[0.0, 0.0, 0.06]])).round(decimals=3), rim(torch.tensor([0.0, 0.0, 0.01])) > 0
+    (tensor([0.0100]), tensor(True))
     """
 
     distance: Distance
 
     @checked
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points, negative inside."""
+        """Return the signed distance [m] of points, negative inside; raise `BadArgument` if it is no finite number."""
         flat = points.detach().double().reshape(-1, 3)
         found = self.distance(flat)
-        good = isinstance(found, Tensor) and found.shape == (len(flat),) and bool(torch.isfinite(found).all())
-        if not good:
-            shown = f"shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
-            raise BadArgument("distance", f"{shown} for {len(flat)} points", "a tensor of one finite number each")
+        if not (isinstance(found, Tensor) and found.shape == flat.shape[:1] and bool(torch.isfinite(found).all())):
+            raise BadArgument("distance", f"{show(found)} for {len(flat)} points", "a tensor of one finite number each")
         return found.to(points).reshape(points.shape[:-1])
 
     @classmethod
     @checked
     def box(cls, low: Float[Tensor, "3"], high: Float[Tensor, "3"], obj_from_box: Pose | None = None) -> "Region":
-        """Return the box between two corners [m], along the axes of the cloud, or of a frame `obj_from_box`.
-
-        >>> Region.box(torch.tensor([-0.1, -0.1, 0.05]), torch.tensor([0.1, 0.1, 0.2]))(torch.tensor([0.0, 0.0, 0.06]))
-        tensor(-0.0100)
-        """
+        """Return the box between two corners [m], along the axes of the cloud, or of a frame `obj_from_box`."""
         if not bool((low < high).all()):
             raise BadArgument("low", f"{low.tolist()} beside high {high.tolist()}", "less than high on each axis")
         middle, half = (low + high).double() / 2, (high - low).double() / 2
@@ -73,13 +65,7 @@ class Region(Value):
     @classmethod
     @checked
     def mesh(cls, mesh: "trimesh.Trimesh | Path | str") -> "Region":
-        """Return the inside of a closed mesh [m], a file or given; raise the errors of a bad mesh (`MeshError`).
-
-        >>> from torchgrasp import load_object
-        >>> jug = load_object("jug")
-        >>> bool(Region.mesh(jug.mesh)(jug.view.points).abs().max() < 0.01)  # [m]
-        True
-        """
+        """Return the inside of a closed mesh [m], a file or given; raise the errors of a bad mesh (`MeshError`)."""
         solid = read_mesh(mesh)
         surface = surface_distance(torch.tensor(np.array(solid.vertices)), torch.tensor(np.array(solid.faces)))
         return cls(lambda points: torch.from_numpy(surface(points.cpu().numpy())).to(points))
@@ -90,12 +76,6 @@ class Region(Value):
         """Return what the pixels of a scene's image cover: the cone of their view rays, the seen and the unseen side.
 
         So a contact behind a marked part of the object is inside, too. What is out of the image is outside.
-
-        >>> from torchgrasp import load_scene
-        >>> scene = load_scene()
-        >>> seen = Region.mask(scene, scene.pixel_labels == 1)
-        >>> bool((seen(scene.cloud(1).points) < 0).all())
-        True
         """
         image = scene.image
         if mask.shape != image.depth.shape or not bool(mask.any()):
@@ -104,13 +84,13 @@ class Region(Value):
         inside = np.pad(mask.cpu().numpy(), 1)  # what lies beyond the border is outside
         outward, inward = (np.asarray(ndimage.distance_transform_edt(x)) for x in (~inside, inside))
         pixels = np.where(inside, 0.5 - inward, outward - 0.5)  # from the middle of a pixel to a border
-        k, camera = image.intrinsics.double().cpu(), inverse(image.obj_from_camera.double()).cpu()
+        k, camera = image.intrinsics.double().cpu().numpy(), inverse(image.obj_from_camera.double()).cpu()
+        focal, middle = np.diag(k)[:2], k[:2, 2] + 1
 
         def distance(points: Tensor) -> Tensor:
             seen = apply(camera, points.cpu()).numpy()
             depth = np.maximum(seen[:, 2], 1e-3)  # behind the camera nothing is seen
-            focal = np.array([float(k[0, 0]), float(k[1, 1])])
-            place = seen[:, :2] / depth[:, None] * focal + np.array([float(k[0, 2]), float(k[1, 2])]) + 1
+            place = seen[:, :2] / depth[:, None] * focal + middle
             found = ndimage.map_coordinates(pixels, place[:, ::-1].T, order=1, mode="nearest")
             return torch.from_numpy(found * depth / focal.mean()).to(points)
 
@@ -119,13 +99,7 @@ class Region(Value):
     @classmethod
     @checked
     def rim(cls, cloud: PointCloud, table: Plane | float, share: Fraction = 0.2) -> "Region":
-        """Return the space above all but the upper `share` of an object's height over its table.
-
-        >>> from torchgrasp import load_object
-        >>> view = load_object("jug").view
-        >>> bool(0.05 < (Region.rim(view, 0.0)(view.points) < 0).double().mean() < 0.4)
-        True
-        """
+        """Return the space of the upper `share` of an object's height over its table."""
         plane = as_plane(table)
         assert plane is not None
         level = (1 - share) * float(plane.height(cloud.points).max())

@@ -16,13 +16,15 @@ from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_as_p
 from torchgrasp.ik.joint import solve_sliding, try_best_seeds
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.ik.refine import ITERATIONS
+from torchgrasp.plan.resist import resist_loads
 from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.report import Report
 from torchgrasp.planner.schedule import OFFERED
 from torchgrasp.planner.stack import Owner, Stack, by_cloud
 from torchgrasp.specs import Ranking
-from torchgrasp.success.features import measure_grasps
+from torchgrasp.success.features import GRIP, measure_grasps
+from torchgrasp.success.loads import strength_of
 from torchgrasp.success.model import load_model
 from torchgrasp.success.order import by_success, grade, is_known, keep_promise, rank_by_variance
 from torchgrasp.values import ContactPlan, Grasps
@@ -174,6 +176,7 @@ class Planner:
             return ranked
         grasps, owner = join_owned(parts)
         grasps = self.stack.first.on_arm(grasps)
+        grasps = prove_resistance(self.stack, Owned(grasps, owner))
         clouds = zip(ranked, by_cloud(owner, len(self.stack)), strict=True)
         return [join([found, grasps[own].to(found.joints.device)]) for found, own in clouds]
 
@@ -217,6 +220,7 @@ def rank(stack: Stack, solved: Owned) -> list[Grasps]:
         buried = torch.where(grasps.status == Status.OK, int(Status.BURIED), grasps.status)
         grasps = dataclasses.replace(grasps, status=buried)
     grasps = problem.on_arm(grasps)
+    grasps = prove_resistance(stack, Owned(grasps, solved.owner))
     rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
     good, body = grasps[rows], stack.body.rows(solved.owner[rows])
     features = measure_grasps(hand, body, good, spec.friction, task, task.lifts(spec.plane))
@@ -235,6 +239,23 @@ def rank(stack: Stack, solved: Owned) -> list[Grasps]:
     ranked, counts = by_success(graded, owner), torch.bincount(owner, minlength=len(stack)).tolist()
     found = [ranked[last - count : last] for last, count in zip(accumulate(counts), counts, strict=True)]
     return found if request.order == "success" else [rank_by_variance(one) for one in found]
+
+
+def prove_resistance(stack: Stack, solved: Owned) -> Grasps:
+    """Return grasps with the loads that they resist; of executable ones, those that resist less than all fail."""
+    loads, grasps = [problem.loads for problem in stack.problems], solved.grasps
+    if loads[0] is None:
+        return grasps
+    task, hand, contacts = stack.first.request.grasp_task, stack.hand, grasps.contacts
+    force = task.pressing(task.lifts(stack.first.spec.plane)) or GRIP
+    strength = strength_of(hand, grasps, force).to(contacts.points)
+    own = torch.stack([x for x in loads if x is not None]).to(contacts.points)[solved.owner]
+    proof = resist_loads(contacts.points, contacts.normals, strength, own, stack.first.spec)
+    fields = dict(zip(("task_margin", "task_load", "task_twist", "task_forces"), proof, strict=True))
+    weak = (grasps.status == Status.OK) & ~(proof.margin >= 1)
+    status = grasps.status.masked_fill(weak, int(Status.NOT_RESISTED))
+    proven = dataclasses.replace(grasps.certificate, task_strength=strength, **fields)
+    return dataclasses.replace(grasps, certificate=proven, status=status)
 
 
 def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:

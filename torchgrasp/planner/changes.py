@@ -50,10 +50,10 @@ def more_starts(request: Request) -> Change:
 
 
 def _regions(request: Request) -> Iterator[Change]:
-    """Yield changes that each give up what the user asks of contacts: a region to keep to, or one to avoid."""
-    for name in ("keep", "avoid"):
+    """Yield changes that each give up what the user asks of contacts: a region to keep to or avoid, a task's loads."""
+    for name in ("keep", "avoid", "resist"):
         if getattr(request, name) is not None:
-            cures = frozenset({Status.OUTSIDE}) | OPEN | OF_HAND
+            cures = OPEN | OF_HAND | {Status.NOT_RESISTED if name == "resist" else Status.OUTSIDE}
             yield Change(f"without {name}", True, cures, dataclasses.replace(request, **{name: None}))
 
 

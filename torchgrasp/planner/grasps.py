@@ -67,6 +67,9 @@ def plan_grasps(
         arm: the arm that carries the hand, from `load_arm`; it must reach each grasp by a straight approach, and lift.
         keep, avoid: a `Region` in which all contacts lie, and one in which none lies; or a function of points (n, 3)
             [m] that returns their signed distance [m], negative inside. Contacts lie on the estimated surface.
+        resist: what contacts must resist, see `Resist`: "lift", "pour", "push", several of them, or `TaskWrenches`.
+            Forces are in the planned friction cones, and of the hand's strength. `Grasps.certificate` has the proof;
+            grasps that resist less than all have the status `NOT_RESISTED`.
         mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.
         ranking: criterion by which grasps are ordered, see `Ranking`; by default "success", in mode "paper" "variance".
         time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of planned guesses.

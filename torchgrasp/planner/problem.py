@@ -38,6 +38,7 @@ from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
 from torchgrasp.specs import ContactSpec
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.promise import describe_promise
+from torchgrasp.success.task import loads_of
 from torchgrasp.values import Grasps, PointCloud
 
 TARGET_POINTS = 1000  # most points of a scene's target that are used: they lie a few millimetres apart
@@ -98,7 +99,7 @@ class Problem:
         """Return the problem of another request on the same object and table, with a small library of `postures`."""
         spec = dataclasses.replace(request.contact_spec, table=self.given_spec.table)
         new = {"request": request, "hand": settle_hand(hand, self.shape.device), "given_spec": spec}
-        dropped = "flat", "drawn", "batches", "obstacles", "world", "buried", "reachable"
+        dropped = "flat", "drawn", "batches", "obstacles", "world", "buried", "reachable", "loads"
         return self.replace(*dropped, postures=postures, **new)
 
     def replace(self, *dropped: str, **changes: Any) -> "Problem":
@@ -182,6 +183,13 @@ class Problem:
         return lift_clearance(self.surface.vertices, self.obstacles) < min(standing, 0.0) - 0.003
 
     @cached_property
+    def loads(self) -> Float[Tensor, "w 6"] | None:
+        """The wrenches [N, N m] about the origin that grasps must resist; None if the request names none."""
+        resist, mass = self.request.resist, self.request.grasp_task.mass
+        upright, table = inverse(self.obj_from_upright).to(self.body.center), self.spec.plane is not None
+        return None if resist is None else loads_of(resist, mass, self.body.center, upright, table)
+
+    @cached_property
     def reachable(self) -> Reachable | None:
         """The function that says which hand poses the arm and the user's function accept, in the upright frame."""
         given, arm, frame = self.request.reachable, self.request.arm, self.obj_from_upright
@@ -224,6 +232,8 @@ class Problem:
             "mixture_sha256": self.mixture_sha256,
             "seed": str(request.seed),
         }
+        if request.resist is not None:
+            meta["resist"] = f"{request.resist} with {request.grasp_task.mass:g} kg"
         return dataclasses.replace(self._moved(grasps), meta=grasps.meta | meta)
 
     def _moved(self, value: Any) -> Any:

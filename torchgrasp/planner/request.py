@@ -20,7 +20,7 @@ from torchgrasp.plan.region import combine
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.specs import ContactSpec, Mode, Ranking
-from torchgrasp.success.task import GraspTask
+from torchgrasp.success.task import GraspTask, Resist
 from torchgrasp.values import PointCloud
 
 Budget = Annotated[float, Range(1e-3, math.inf)]
@@ -49,6 +49,7 @@ class SceneOptions(TypedDict, total=False):
     arm: Arm | None
     keep: Where | None
     avoid: Where | None
+    resist: Resist | None
 
 
 class PlanOptions(SceneOptions, total=False):
@@ -87,6 +88,7 @@ class Request:
     arm: Arm | None = None
     keep: Where | None = None
     avoid: Where | None = None
+    resist: Resist | None = None
     time_budget: Budget | None = None
 
     def __post_init__(self) -> None:

@@ -71,6 +71,15 @@ def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -
     return (torque.new_tensor([hand.actuators[name].effort for name in hand.joint_names]) / torque.abs()).amin(1)
 
 
+def strength_of(hand: Hand, grasps: Grasps, most: float) -> Float[Tensor, "g f"]:
+    """Return the greatest normal force [N] of each fingertip alone, by its drives, of at most `most` [N]."""
+    normals = grasps.contacts.normals.to(grasps.joints)
+    alone = [
+        torch.zeros_like(normals).index_copy(1, k, -normals[:, k]) for k in torch.arange(normals.shape[1])[:, None]
+    ]
+    return torch.stack([greatest_force(hand, grasps, one) for one in alone], 1).nan_to_num(0.0).clamp(0.0, most)
+
+
 def log_odds_about(
     grasps: Grasps, centers: Float[Tensor, "c 3"], friction: float, weight: Sequence[float]
 ) -> Float[Tensor, "g c"]:

@@ -1,11 +1,18 @@
 """What a grasp must do, which decides whether it holds."""
 
 import dataclasses
+import itertools
+import math
 from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Force, Range, checked
 from torchgrasp.errors import BadArgument
+from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.plane import Plane
 
 
@@ -54,3 +61,53 @@ class GraspTask(Value):
     def lifts(self, table: Plane | None) -> bool:
         """Return whether the object is lifted: as `lift` says, or else if there is a table and no open loop."""
         return table is not None and self.closing != "open_loop" if self.lift is None else self.lift
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class TaskWrenches(Value):
+    """The loads of an object in a task, each a force [N], weight included, and a torque [N m], in the cloud's frame.
+
+    Torques are about `point` [m], by default the estimated centre. Raises `BadArgument` for no load, or one of zeros.
+
+    >>> unscrew = TaskWrenches(torch.tensor([[0.0, 0.0, -2.5, 0.0, 0.0, 0.1], [0.0, 0.0, -2.5, 0.0, 0.0, -0.1]]))
+    """
+
+    wrenches: Float[Tensor, "w 6"]
+    point: Float[Tensor, "3"] | None = None
+
+    def __post_init__(self) -> None:
+        if not len(self.wrenches) or not bool(self.wrenches.any(1).all()):
+            raise BadArgument("wrenches", f"{len(self.wrenches)} wrenches, or one of zeros", "loads of the object")
+
+
+TaskName = Literal["lift", "pour", "push"]
+Resist = TaskName | tuple[TaskName, ...] | TaskWrenches
+"""What grasps must resist: `TaskWrenches`, or names of loads at the estimated centre. Without a table z points up.
+
+* "lift": the weight.
+* "pour": the weight while the object is tilted by up to 120 degrees about any horizontal axis.
+* "push": the weight, and 2.5 N in any direction.
+"""
+
+
+def loads_of(
+    resist: Resist, mass: float, center: Float[Tensor, "3"], upright_from_obj: Float[Tensor, "4 4"], table: bool
+) -> Float[Tensor, "w 6"]:
+    """Return the wrenches of a task about the origin of the upright frame, for a `center` [m] in this frame."""
+    if isinstance(resist, TaskWrenches):
+        vectors = rotate(upright_from_obj, resist.wrenches.to(center).reshape(-1, 3))
+        force, torque = vectors.reshape(-1, 6).split(3, -1)
+        point = center if resist.point is None else apply(upright_from_obj, resist.point.to(center)[None])[0]
+    else:
+        axes = torch.eye(3, dtype=torch.float64)
+        corners = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)]) / math.sqrt(3)
+        around = 1.24 * torch.cat([corners, axes, -axes])  # mixtures of these vectors fill the unit ball
+        weight = torch.tensor([[0.0, 0.0, -9.81 * mass]], dtype=torch.float64)
+        # Without the vector that points up, mixtures fill the ball up to 120 degrees from straight down.
+        loads = {"lift": weight, "pour": 9.81 * mass * around[around[:, 2] < 1.2], "push": weight + 2.5 * around}
+        names = (resist,) if isinstance(resist, str) else resist
+        force = torch.cat([loads[name] for name in names]).to(center)
+        force = force if table else force @ upright_from_obj[:3, :3].T
+        torque, point = torch.zeros_like(force), center
+    return torch.cat([force, torque + torch.linalg.cross(point.expand_as(force), force)], -1)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import Command, Progress, arguments, naming, nested, option, positional
-from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, write_report
+from torchgrasp.app.report.page import grasp_columns, grasp_rows, write_report
 from torchgrasp.app.report.recording import import_rerun, write_recording
 from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.viewer import VIEW, write_viewer
@@ -39,6 +39,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec, Mode, TrialSpec
 from torchgrasp.success import GraspTask, explain_success
+from torchgrasp.success.task import TaskName
 from torchgrasp.values import Grasps, PointCloud, format_success
 
 Among = Literal["auto"] | None
@@ -83,6 +84,7 @@ class Grasp(Command):
         None, 'where contacts may be: a closed mesh, or a box as "X0 Y0 Z0 X1 Y1 Z1" [m] in the frame of the cloud'
     )
     avoid: str | None = option(None, "where no contact may be: a mesh or a box, as in --keep")
+    resist: tuple[TaskName, ...] = option((), "loads of --mass that the contacts must resist with the hand's strength")
     no_report: bool = option(False, "write the grasps without the pages")
     rerun: bool = option(False, 'also write run.rrd, a recording of plan and closing (needs the extra "rerun")')
 
@@ -166,7 +168,7 @@ class Grasp(Command):
 
     def _task(self) -> dict[str, Any]:
         """Return the options of the planner that say what the grasps must do."""
-        return {"task": GraspTask(self.mass), "promise": self.promise, **self._where}
+        return {"task": GraspTask(self.mass), "promise": self.promise, "resist": self.resist or None, **self._where}
 
     @functools.cached_property
     def _where(self) -> dict[str, Region | None]:
@@ -270,7 +272,7 @@ STAGES = ("shape", "plan", "certify", "query", "refine")  # stages of planning, 
 def print_grasps(run: Run) -> bool:
     """Print the five best grasps and the verdict; return whether any grasp is executable."""
     if len(run.executable):
-        print(f"\n{format_columns([GRASP_COLUMNS, *grasp_rows(run.executable, 5)])}\n")
+        print(f"\n{format_columns([grasp_columns(run.grasps), *grasp_rows(run.executable, 5)])}\n")
     for sentence in run.costs:
         print(f"lowers success  {sentence}")
     print(verdict(run))

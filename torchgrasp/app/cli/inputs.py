@@ -168,16 +168,14 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
 
 def read_region(name: str, text: str | None) -> Region | None:
     """Return the box of six numbers in the text of option `name`, or the mesh that it names; None for None."""
-    if text is None:
-        return None
     with naming(mesh=name, low=name, high=name):
         try:
-            numbers = torch.tensor([float(word) for word in text.split()], dtype=torch.float64)
+            numbers = torch.tensor([float(word) for word in (text or "").split()], dtype=torch.float64)
         except ValueError:
-            return Region.mesh(Path(text))
-        if len(numbers) != 6:
+            return Region.mesh(Path(str(text)))
+        if text is not None and len(numbers) != 6:
             raise BadArgument("mesh", repr(text), "six numbers of a box, or the file of a closed mesh")
-        return Region.box(numbers[:3], numbers[3:])
+        return None if text is None else Region.box(numbers[:3], numbers[3:])
 
 
 def find_cloud(path: Path, name: str = "CLOUD") -> Path:

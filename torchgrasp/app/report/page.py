@@ -101,7 +101,7 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
             *((name, result, f"{seconds:.1f}") for name, result, seconds in run.stages),
             ("total", "", f"{sum(seconds for *_, seconds in run.stages):.1f}"),
         ],
-        columns=GRASP_COLUMNS,
+        columns=grasp_columns(run.grasps),
         rows=grasp_rows(run.executable),
         lost=[(x.stage, f"{x.kept} of {x.given} {x.things}", x.reasons) for x in funnel if x.given],
         tried=[(t.words, str(t.executable), f"{t.expected:.0%}") for t in trials],
@@ -113,8 +113,13 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
     )  # fmt: skip
 
 
+def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
+    """Return the titles of the columns of `grasp_rows`: `GRASP_COLUMNS`, and what of the task's loads is resisted."""
+    return (*GRASP_COLUMNS, *["task margin"] * (grasps.certificate.task_margin is not None))
+
+
 def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
-    """Return the first grasps as text, in the order of `GRASP_COLUMNS`."""
+    """Return the first grasps as text, in the order of `grasp_columns`."""
     return [
         (
             str(rank),
@@ -124,6 +129,7 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
             f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
             f"{float(grasp.certificate.margin[0]):.4f}",
             "" if grasp.contacts.std_m is None else f"{1e3 * float(grasp.contacts.std_m[0].max()):.1f}",
+            *("" if (task := grasp.certificate.task_margin) is None else [f"{float(task[0]):.2f}"]),
         )
         for rank, grasp in enumerate(grasps[:most], 1)
     ]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, map_colors
 from torchgrasp.app.report.film import describe_film
-from torchgrasp.app.report.page import GRASP_COLUMNS, grasp_rows, render
+from torchgrasp.app.report.page import grasp_columns, grasp_rows, render
 from torchgrasp.app.report.run import Run, moments_of, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
 from torchgrasp.app.report.stills import facing, to_array, view_of
@@ -146,9 +146,10 @@ def _surface(run: Run) -> dict[str, object]:
 
 def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
     """Return the table rows of grasps, their contacts, and all link poses in each of the `POSTURES`."""
-    columns = (0, 1, 5, 3, 6)  # rank, success, margin, clearance and standard deviation
+    heads = grasp_columns(grasps)
+    columns = (0, 1, 5, 3, *range(6, len(heads)))  # rank, success, margin, clearance, standard deviation, task margin
     return {
-        "heads": [GRASP_COLUMNS[k] for k in columns],
+        "heads": [heads[k] for k in columns],
         "rows": [[row[k] for k in columns] for row in grasp_rows(grasps, MOST_GRASPS)],
         "points": pack(to_array(grasps.contacts.points)),
         "normals": pack(to_array(grasps.contacts.normals)),

@@ -1,0 +1,107 @@
+"""Grasps that resist a task: the loads in the caller's frame, their proof, and what becomes of weaker grasps."""
+
+import json
+
+import pytest
+import torch
+
+from tests.make import directions, load_hand, random_motion, real, same_bits
+from tests.plan.test_resist import by_highs
+from torchgrasp import ContactSpec, GraspTask, Status, explain_empty, load_grasps, load_object, plan_grasps
+from torchgrasp.app.report.page import grasp_columns, grasp_rows
+from torchgrasp.errors import BadArgument
+from torchgrasp.export import format_grasps
+from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.geometry.plane import Plane, move
+from torchgrasp.planner.many import estimate_shapes, plan_stacks
+from torchgrasp.planner.request import Request
+from torchgrasp.success import TaskWrenches
+from torchgrasp.success.task import loads_of
+
+HAND, VIEW = load_hand("allegro"), load_object("jug").view
+FRAME = random_motion(7)
+SPEC = ContactSpec(table=Plane.horizontal(0.0).moved(FRAME))
+MASS = 0.2
+
+
+@pytest.fixture(scope="module")
+def poured():
+    """Grasps that resist pouring, of a jug on a tilted table."""
+    return plan_grasps(move(VIEW, FRAME), HAND, SPEC, 40, task=GraspTask(MASS), resist=("lift", "pour"))
+
+
+def test_every_tilt_of_the_weight_is_resisted_and_weaker_grasps_say_so(poured):
+    margin = poured.certificate.task_margin
+    judged = (poured.status == Status.OK) | (poured.status == Status.NOT_RESISTED)
+    assert torch.equal(poured.status[judged] == Status.OK, margin[judged] >= 1)
+    good = poured[poured.status == Status.OK]
+    assert 0 < len(good) < int(judged.sum())
+    tilted = directions(300)
+    tilted = rotate(FRAME, tilted[tilted[:, 2] < 0.5])  # at most 120 degrees from straight down
+    for grasp in good[:3]:
+        points, normals = grasp.contacts.points[0], grasp.contacts.normals[0]
+        load = grasp.certificate.task_load[0]
+        centre = points.mean(0) + offset(load)  # the object's, seen from that of the contacts
+        for force in 9.81 * MASS * tilted[::20]:
+            wrench = torch.cat([force, torch.linalg.cross(centre, force)])
+            assert by_highs(points, normals, grasp.certificate.task_strength[0].numpy(), wrench.numpy()) >= 1 - 1e-9
+
+
+def offset(load):
+    """The arm on which the force of a load has its torque; the part along the force does not matter."""
+    return torch.linalg.cross(load[:3], load[3:]) / load[:3].square().sum()
+
+
+def test_no_drive_gives_more_than_its_torque_for_the_strength_of_a_fingertip(poured):
+    good = poured[poured.status == Status.OK]
+    obj_from_hand = good.obj_from_hand
+    jacobian = HAND.jacobian(good.joints, apply(inverse(obj_from_hand), good.contacts.points))
+    push = -good.certificate.task_strength[..., None] * rotate(inverse(obj_from_hand), good.contacts.normals)
+    torque = torch.einsum("gfih,gfi->gfh", jacobian, push).abs()
+    share = (torque / real([HAND.actuators[name].effort for name in HAND.joint_names])).amax(-1)
+    assert float(share.max()) < 1 + 1e-9
+    assert bool(((share > 1 - 1e-9) | (good.certificate.task_strength == 15)).all())
+
+
+def test_the_proof_is_saved_exported_and_shown(poured, tmp_path):
+    poured.save(tmp_path / "grasps.safetensors")
+    assert same_bits(load_grasps(tmp_path / "grasps.safetensors"), poured)
+    best = json.loads(format_grasps(HAND, poured[:1]))["grasps"][0]
+    assert best["task_margin"] == float(poured.certificate.task_margin[0]) and len(best["task_forces"]) == 3
+    assert grasp_columns(poured)[-1] == "task margin"
+    assert grasp_rows(poured, 1)[0][-1] == f"{best['task_margin']:.2f}"
+    assert "pour" in poured.meta["resist"] and "0.2 kg" in poured.meta["resist"]
+
+
+def test_wrenches_about_a_point_are_those_of_the_callers_frame():
+    point, about = real([0.1, 0.2, 0.3]), real([[1.0, 2.0, 3.0, 0.1, 0.2, 0.3]])
+    for given in (point, None):
+        (there,) = loads_of(
+            TaskWrenches(about, given), 1.0, apply(inverse(FRAME), point[None])[0], inverse(FRAME), True
+        )
+        force, torque = rotate(FRAME, there.view(2, 3))
+        foot = FRAME[:3, 3]  # the origin of the upright frame
+        torch.testing.assert_close(force, about[0, :3])
+        torch.testing.assert_close(torque, about[0, 3:] + torch.linalg.cross(point - foot, force))
+    down = loads_of("lift", 1.0, torch.zeros(3).double(), inverse(FRAME), False)[0, :3]
+    torch.testing.assert_close(rotate(FRAME, down[None])[0], real([0.0, 0.0, -9.81]))  # of the cloud, without a table
+    with pytest.raises(BadArgument, match="wrenches"):
+        TaskWrenches(torch.zeros(1, 6))
+
+
+def test_many_clouds_resist_alone_as_together():
+    spec, views = ContactSpec(table=0.0), [VIEW, load_object("cylinder").view]
+    alone = plan_grasps(views, HAND, spec, 8, resist="lift")
+    requests = [Request(view, HAND, spec, 8, resist="lift") for view in views]
+    stacked = plan_stacks(requests, estimate_shapes(requests, 0), torch.device("cpu"))
+    for one, other in zip(alone, stacked, strict=True):
+        assert torch.equal(one.status, other.status)
+        shared = one.status == Status.OK
+        torch.testing.assert_close(one.certificate.task_margin[shared], other.certificate.task_margin[shared])
+
+
+def test_a_load_that_is_too_great_is_named_and_given_up():
+    heavy = TaskWrenches(real([[0.0, 0.0, -500.0, 0.0, 0.0, 0.0]]))
+    told = explain_empty(VIEW, HAND, ContactSpec(table=0.0), 20, resist=heavy)
+    assert told.best is not None and told.best.words == "without resist"
+    assert Status.NOT_RESISTED in told.funnel.stages[-1].lost
