@@ -177,8 +177,9 @@ def test_the_table_is_at_the_lowest_point_that_is_no_outlier_unless_it_is_given(
     """Those are outliers whose eight nearest points are 2.5 times as far as half of the points have theirs."""
     seen = []
 
-    def note(cloud, hand, spec, starts, seed, fingers, mode, observer, time_budget, task, promise):
+    def note(cloud, hand, spec, starts, seed, fingers, mode, observer, time_budget, task, promise, **where):
         assert mode == "joint" and fingers is None and time_budget is None and promise is None
+        assert where == {"keep": None, "avoid": None, "resist": None}
         assert task == GraspTask()
         apart = torch.cdist(cloud.points.double(), cloud.points.double()).sort(1).values[:, 1:9].mean(1)
         lowest = float(cloud.points[apart <= 2.5 * apart.median(), 2].min())

@@ -80,14 +80,14 @@ def test_a_thing_is_grasped_by_click_or_mask(seen, grasp, tmp_path, click):
 def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, grasp, monkeypatch):
     thing, asked = ThingPlan(2, 0.5, reason="too heavy"), []
 
-    def note(scene, hand, *_, fingers, enough, task, promise):
+    def note(scene, hand, *_, fingers, enough, task, promise, resist, **where):
         asked.append((hand.finger_names, fingers))
-        assert task.mass == 0.4 and promise == 0.8
+        assert task.mass == 0.4 and promise == 0.8 and resist == ("lift",)
         return ScenePlan((thing,))
 
     monkeypatch.setattr("torchgrasp.app.cli.grasps.plan_scene", note)
     for wanted, passed in (("default", None), ("f3,f1,f2", None), ("auto", "auto")):
-        code, words = grasp(seen, "--fingers", wanted, "--mass", "0.4", "--promise", "0.8")
+        code, words = grasp(seen, "--fingers", wanted, "--mass", "0.4", "--promise", "0.8", "--resist", "lift")
         assert asked.pop() == (("f3", "f1", "f2") if "," in wanted else ("f1", "f2", "f3"), passed)
     assert code == 1 and "object 2" in words and "too heavy" in words and "no executable grasp of any object" in words
 
