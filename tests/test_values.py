@@ -1,16 +1,20 @@
 """Value types: checks at construction, rows, devices and dtypes, statuses, a short and true text."""
 
+import copy
 import dataclasses
 import math
+import pickle
 
 import numpy as np
 import pytest
 import torch
 
+from tests.make import see
 from tests.pinch import pinch
 from torchgrasp import load_object
 from torchgrasp.base import Value, check_whole, count_status, join, pick, put
 from torchgrasp.errors import BadArgument, FailedRows, Status, TooFewPoints
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Certificate, ContactPlan, Contacts, PointCloud
 
@@ -173,3 +177,46 @@ def test_a_value_of_too_many_fields_is_cut():
     Wide = dataclasses.make_dataclass("Wide", [(name, torch.Tensor) for name in names], bases=(Value,), frozen=True)
     text = repr(Wide(*(torch.zeros(9) for _ in names)))
     assert len(text.splitlines()) == 12 and text.endswith("...)")
+
+
+VALUES = {
+    "Grasps": lambda: pinch("allegro")[1],
+    "Hand": lambda: pinch("allegro")[0],
+    "PointCloud": lambda: load_object("jug").view,
+    "ContactSpec": lambda: ContactSpec(table=Plane.horizontal(0.1)),
+    "ContactPlan": lambda: plan([0, 14]),
+    "Scene": lambda: see((0.0, 0.0, 0.06, 0.1)),
+}
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_copies_and_pickled_values_are_equal_and_have_one_hash(name):
+    value = VALUES[name]()
+    for again in (copy.deepcopy(value), pickle.loads(pickle.dumps(value)), dataclasses.replace(value)):  # noqa: S301
+        assert again == value and hash(again) == hash(value) and {value: 1}[again] == 1
+    assert value != name and value is not again
+
+
+def test_values_differ_by_one_number_a_dtype_or_a_text_and_missing_numbers_are_equal():
+    one = plan([0, 14])
+    quality = one.quality.clone()
+    quality[1] = torch.nan
+    missing = dataclasses.replace(one, quality=quality)
+    assert missing == dataclasses.replace(one, quality=quality.clone()) != one
+    assert one != one.to(torch.float64) and one != one[:1]
+    grasp = pinch("allegro")[1]
+    assert grasp != dataclasses.replace(grasp, meta=grasp.meta | {"seed": "another"})
+    assert len({grasp, grasp[[0]], grasp[[0, 0]]}) == 2
+
+
+def test_a_hand_is_pickled_without_what_was_derived_from_it():
+    hand = pinch("allegro")[0]
+    before = len(pickle.dumps(hand))
+    hand.derived["library"] = torch.zeros(100_000)
+    assert hand.motion and len(pickle.dumps(hand)) == before
+
+
+def test_what_is_no_value_of_numbers_is_equal_to_itself_alone():
+    jug = load_object("jug")
+    assert jug == jug and jug != load_object("jug") and hash(jug) == hash(jug)
+    assert torch.equal(copy.deepcopy(jug).view.points, jug.view.points)

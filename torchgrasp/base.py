@@ -56,12 +56,29 @@ class kept(functools.cached_property[Kept]):
 
 
 class Value:
-    """Base class of all values: frozen dataclasses of tensors. `.to()` returns a copy on another device or dtype."""
+    """Base class of all values: frozen dataclasses of tensors. `.to()` returns a copy on another device or dtype.
+
+    Values are equal if all their numbers are, on one device; NaN equals NaN. Copies and pickled values keep no caches.
+    """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if "__repr__" not in vars(cls):
-            cls.__repr__ = Value.__repr__
+        for name in ("__repr__", "__eq__", "__hash__"):  # before `dataclass` writes its own
+            if name not in vars(cls):
+                setattr(cls, name, vars(Value)[name])
+
+    def __eq__(self, other: object) -> bool:
+        return _same(self._compared(), other._compared()) if type(self) is type(other) else NotImplemented  # pyright: ignore
+
+    def __hash__(self) -> int:
+        return _digest(self._compared())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # pyright: ignore[reportArgumentType]
+
+    def _compared(self) -> tuple[Any, ...]:
+        """Return the fields that equal values share."""
+        return tuple(getattr(self, f.name) for f in dataclasses.fields(self) if f.compare)  # pyright: ignore
 
     def __repr__(self) -> str:
         """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small tensors."""
@@ -82,6 +99,28 @@ class Value:
             return moved if x.is_floating_point() else moved.to(x.dtype)
 
         return map_tensors(move, self)
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two fields of values are equal."""
+    if isinstance(one, Tensor) and isinstance(other, Tensor):
+        alike = (one.shape, one.dtype, one.device) == (other.shape, other.dtype, other.device)
+        return alike and bool(((one == other) | ((one != one) & (other != other))).all())
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple | list) and type(one) is type(other):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return one is other or bool(one == other)
+
+
+def _digest(value: Any) -> int:
+    """Return a number that equal fields share, from a few numbers of each tensor."""
+    if isinstance(value, Tensor):
+        flat, some = value.detach().reshape(-1), 8
+        return hash((value.shape, *flat[:: max(1, len(flat) // some)].nan_to_num().tolist()))
+    if isinstance(value, dict):
+        return hash(frozenset((key, _digest(x)) for key, x in value.items()))
+    return hash(tuple(map(_digest, value)) if isinstance(value, tuple | list) else value)
 
 
 def _short(value: Any) -> str:

@@ -22,7 +22,7 @@ GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", 
 
 
 @checked
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class GraspObject:
     """An object to grasp with its mass [kg]; all lengths are in metres, and the object rests at z = 0 with z up.
 
