@@ -4,12 +4,14 @@ import dataclasses
 
 import pytest
 import torch
+import yaml
 from benchmarks.ur5e import ur5e
 
 from tests.make import distance_field, random_motion, real
 from torchgrasp import ContactSpec, Plane, Status, load_object, plan_grasps
 from torchgrasp.arm.reach import follow_grasps, way_of
 from torchgrasp.errors import BadArgument
+from torchgrasp.export import format_motion, plan_motion
 from torchgrasp.geometry.plane import move
 from torchgrasp.ik import CollisionWorld
 
@@ -90,3 +92,25 @@ def test_saved_grasps_keep_the_arm(good, tmp_path):
     found = load_grasps(tmp_path / "grasps.safetensors")
     assert torch.equal(found.arm, good.arm) and torch.equal(found.ease, good.ease)
     assert dataclasses.replace(good, arm=None, ease=None)[0].arm is None
+
+
+def test_a_motion_has_all_joints_and_goes_through_the_grasp(arm, hand, good):
+    motion = plan_motion(arm, hand, good[:3])
+    assert motion.joint_names == (*arm.joint_names, *hand.tree.joint_names) and (motion.times.diff() > 0).all()
+    at, fingers = motion.phases, motion.positions[..., 6:]
+    assert list(at) == ["above", "pregrasp", "grasp", "squeeze", "lift"] and at["lift"] == len(motion.times) - 1
+    assert torch.equal(motion.positions[:, at["grasp"], :6], good.arm[:3])
+    for phase, joints in (("above", good.pregrasp), ("pregrasp", good.pregrasp), ("grasp", good.joints)):
+        assert torch.allclose(fingers[:, at[phase]], hand.expand_joints(joints[:3]))
+    risen = arm.hand_poses(motion.positions[:, -1, :6])[:, :3, 3] - good.obj_from_hand[:3, :3, 3]
+    assert torch.allclose(risen, real([0, 0, 0.1]).expand(3, 3), atol=1e-4)
+    most = motion.positions[..., :6].diff(dim=1).abs() / motion.times.diff()[:, None]
+    assert (most <= arm.speed).all()
+    documents = list(yaml.safe_load_all(format_motion(hand, motion)))
+    assert len(documents) == 3 and documents[0]["joint_names"] == list(motion.joint_names)
+    points = documents[2]["points"]
+    assert torch.allclose(real([point["positions"] for point in points]), motion.positions[2], atol=1e-8)
+    seconds = [point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"] for point in points]
+    assert torch.allclose(real(seconds), motion.times)
+    with pytest.raises(BadArgument, match=r"grasps: .*posture of this arm"):
+        plan_motion(arm, hand, dataclasses.replace(good[:1], arm=None))

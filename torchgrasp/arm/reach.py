@@ -61,7 +61,7 @@ def follow_grasps(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld) -
         rows = torch.nonzero(~found & (ease.gather(1, choice[:, None])[:, 0] >= 0))[:, 0]
         if not len(rows):
             break
-        path, good = _track(arm, joints[:, rows * starts + choice[rows]], tips[:, :, rows])
+        path, good = track(arm, joints[:, rows * starts + choice[rows]], tips[:, :, rows])
         good &= in_chunks(lambda x: (_is_clear(arm, x, world),), path, 64)[0]
         rows, path = rows[good], path[good]
         way[rows], found[rows] = path, True
@@ -81,7 +81,7 @@ def way_of(hand: Hand, grasps: Grasps, world: CollisionWorld) -> Float[Tensor, "
     return torch.cat([before, after], 1)
 
 
-def _track(
+def track(
     arm: Arm, start: Float[Tensor, "n g"], tips: Float[Tensor, "3 4 g w"]
 ) -> tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"]]:
     """Return postures that follow the tips from the grasp both ways, and whether each does so steadily.

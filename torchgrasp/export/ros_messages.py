@@ -12,6 +12,7 @@ from torch import Tensor
 from torchgrasp.checks import Force, Pose, Positive, checked
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.errors import BadArgument
+from torchgrasp.export.arm_motion import ArmMotion
 from torchgrasp.export.postures import named_postures, quaternion, rename_joints
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
@@ -106,6 +107,26 @@ def format_trajectories(
     """
     what, documents = "a trajectory_msgs/JointTrajectory for each grasp", _trajectories(hand, grasps, force, kp, rename)
     return _document(hand, what, documents)
+
+
+@checked
+def format_motion(hand: Hand, motion: ArmMotion) -> str:
+    """Return a YAML document of trajectory_msgs/JointTrajectory, with the joints of arm and hand, for each grasp.
+
+    >>> from torchgrasp import load_hand
+    >>> motion = ArmMotion(("a",), torch.tensor([0.0, 1.5]), torch.zeros(1, 2, 1), {"above": 0})
+    >>> format_motion(load_hand("barrett"), motion).splitlines()[-1]
+    '  time_from_start: {sec: 1, nanosec: 500000000}'
+    """
+    times = [{"sec": int(x), "nanosec": round(1e9 * (x % 1))} for x in motion.times.tolist()]
+    documents = [
+        {
+            "joint_names": list(motion.joint_names),
+            "points": [{"positions": q, "time_from_start": at} for q, at in zip(rows, times, strict=True)],
+        }
+        for rows in motion.positions.tolist()
+    ]
+    return _document(hand, "a trajectory_msgs/JointTrajectory of arm and hand for each grasp", documents)
 
 
 def _trajectories(
