@@ -17,7 +17,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
 from torchgrasp.lazy import spatial
-from torchgrasp.sim.mujoco_scene import add_drive, add_links, format_numbers
+from torchgrasp.sim.mujoco_scene import nest_links, render_mjcf
 from torchgrasp.values import Grasps
 
 CONVENTIONS = {
@@ -158,34 +158,25 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positiv
     >>> text.count("<key ")
     4
     """
-    grasps = grasps.to("cpu")
+    grasps, urdf = grasps.to("cpu"), read_urdf(hand.urdf_path)
     _, postures = named_postures(hand, grasps, force, kp)
-    root = ET.Element("mujoco", model=hand.name)
-    ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    tags = "custom", "worldbody", "actuator", "keyframe"
-    custom, world, actuator, keyframes = (ET.SubElement(root, tag) for tag in tags)
-    palm = add_links(world, read_urdf(hand.urdf_path), np.eye(4))
-    palm.insert(0, ET.Element("freejoint", name="hand"))
-    order = [joint.attrib["name"] for joint in palm.iter("joint")]  # bodies as they nest, as MuJoCo numbers them
-    for name in order:
-        drive = hand.actuators[name]
-        add_drive(actuator, name, drive if kp is None else drive._replace(kp=kp))
-    free = "hand/x hand/y hand/z hand/qw hand/qx hand/qy hand/qz".split()
-    ET.SubElement(custom, "text", name="qpos", data=" ".join([*free, *order]))
-    ET.SubElement(custom, "text", name="ctrl", data=" ".join(order))
-    keys = (  # name, distance from the pose, joints, targets
+    nested = nest_links(urdf)
+    order = [joint.name for _, joint, _ in nested if joint and joint.kind != "fixed"]  # as MuJoCo numbers them
+    steps = (  # name, distance from the pose, joints, targets
         ("approach", APPROACH_DISTANCE, "pregrasp", "pregrasp"),
         ("pregrasp", 0.0, "pregrasp", "pregrasp"),
         ("grasp", 0.0, "grasp", "grasp"),
         ("squeeze", 0.0, "grasp", "squeeze"),
     )
-    opened = opened_pose(hand.to("cpu"), grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    opened, keys = opened_pose(hand.to("cpu"), grasps.pregrasp, grasps.obj_from_hand, grasps.table), []
     for row, closed in enumerate(grasps.obj_from_hand):
-        for name, distance, state, targets in keys:
+        for name, distance, state, targets in steps:
             pose = opened[row] if state == "pregrasp" else closed
             position = pose[:3, 3] - distance * grasps.approach[row]
             joints, control = ([float(postures[x][joint][row]) for joint in order] for x in (state, targets))
-            qpos = format_numbers([*position.tolist(), *quaternion(pose), *joints])
-            ET.SubElement(keyframes, "key", name=f"grasp_{row}_{name}", qpos=qpos, ctrl=format_numbers(control))
+            keys.append((f"grasp_{row}_{name}", [*position.tolist(), *quaternion(pose), *joints], control))
+    drives = {name: x if kp is None else x._replace(kp=kp) for name, x in hand.actuators.items()}
+    known = {"name": hand.name, "nested": nested, "pose": np.eye(4), "order": order, "drives": drives, "keys": keys}
+    root = ET.fromstring(render_mjcf("keyframes.xml", **known))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"

@@ -1,6 +1,7 @@
 """Atomic writing of files (written under another name, then moved into place), and locks on folders and files."""
 
 import contextlib
+import functools
 import hashlib
 import io
 import json
@@ -8,13 +9,14 @@ import math
 import os
 import socket
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 from filelock import FileLock, Timeout
 
 from torchgrasp.errors import BadArgument, OutputError, Status
+from torchgrasp.lazy import jinja2
 
 Refuse = Callable[[str, str], BadArgument]  # makes an error of what was found and what is allowed
 ENDING = ".part"  # ending of the name under which a file is written; a dot and the name of the file come first
@@ -121,6 +123,22 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Status):
         return value.name
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def render(template: Path, filters: Mapping[str, Callable[..., object]] | None = None, **values: Any) -> str:
+    """Return a text from a template of Jinja and values; texts that are put into HTML or XML are escaped."""
+    engine = _engine(template.parent)
+    engine.filters |= filters or {}
+    return engine.get_template(template.name).render(values)
+
+
+@functools.cache
+def _engine(folder: Path) -> "jinja2.Environment":
+    """Return the template engine of a folder."""
+    loader, escape = jinja2.FileSystemLoader(folder), jinja2.select_autoescape(("html", "js", "css", "xml.jinja"))
+    return jinja2.Environment(
+        loader=loader, autoescape=escape, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    )
 
 
 def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) -> str:

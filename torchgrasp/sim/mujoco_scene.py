@@ -1,27 +1,21 @@
 """A simulated scene in MuJoCo, and its model in MJCF, MuJoCo's XML format."""
 
 import copy
-import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchgrasp.errors import HandFileError, MissingExtra
+from torchgrasp.files import render
 from torchgrasp.geometry.frames import rotation_from_rpy
-from torchgrasp.hand.hand import Actuator
-from torchgrasp.hand.urdf import Link, Urdf
+from torchgrasp.hand.urdf import Joint, Link, Urdf
 from torchgrasp.sim.scene import STILL, Scene
-from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, pair_masks
+from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, SceneSpec, pair_masks
 
-OBJECT, TABLE, NEIGHBOUR = "torchgrasp_object", "torchgrasp_table", "torchgrasp_neighbour_{}"
-"""Names of the object (its body and its free joint), of the table, and of the neighbours, which are numbered."""
-HAND_BIT, OBJECT_BIT, TABLE_BIT, FREE_BIT = 1, 2, 4, 3
-"""Bits of three collision groups, which all collide except the hand with itself; number of the first bit after them."""
-OPTION = {"integrator": "implicitfast", "cone": "elliptic", "impratio": "10", "noslip_iterations": "2"}
-"""Options of MuJoCo's solver, from DexGraspBench (arXiv 2412.16490)."""
-SOLREF, SOLIMP = "0.005 1", "0.5 0.99 0.0001"
-"""Contact springs: time constant [s] and damping ratio, and impedance over depth, as in DexGraspBench."""
+OBJECT, NEIGHBOUR = "torchgrasp_object", "torchgrasp_neighbour_{}"
+"""Names of the object (its body and its free joint), and of the neighbours, which are numbered."""
 
 
 class MujocoScene(Scene):
@@ -181,119 +175,34 @@ def import_mujoco() -> Any:
 
 def scene_mjcf(spec: SceneSpec) -> str:
     """Return MuJoCo's XML model of a scene (MJCF), with all joints at zero and a position servo for each joint."""
-    urdf = spec.urdf
-    movable = [joint.name for joint in urdf.joints if joint.kind != "fixed"]
-    spec.check_drives(movable)
-    root = ET.Element("mujoco", model="torchgrasp")
-    ET.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    option = ET.SubElement(root, "option", OPTION, timestep=repr(spec.timestep), gravity=f"0 0 {-spec.gravity!r}")
-    ET.SubElement(option, "flag", multiccd="enable", autoreset="disable")
-    default = ET.SubElement(root, "default")
-    friction, slick = (format_numbers((x, x * spec.patch, 0.0)) for x in (spec.friction, spec.body_friction))
-    condim = "4" if spec.patch > 0 else "3"
-    ET.SubElement(default, "geom", friction=friction, condim=condim, solref=SOLREF, solimp=SOLIMP)
-    ET.SubElement(default, "joint", solreflimit=SOLREF)
-    ET.SubElement(default, "mesh", inertia="shell")
-    asset, world, actuator = (ET.SubElement(root, tag) for tag in ("asset", "worldbody", "actuator"))
-    if spec.table:
-        bits = _bits(TABLE_BIT, HAND_BIT)
-        height = format_numbers((0.0, 0.0, spec.table_height))
-        ET.SubElement(world, "geom", bits, name=TABLE, type="plane", size="1 1 0.1", pos=height, friction=slick)
-    for k, (body, hulls) in enumerate(zip((spec.body, *spec.neighbours), spec.hulls, strict=True)):
-        name, hits = (NEIGHBOUR.format(k - 1), OBJECT_BIT) if k else (OBJECT, 0)
-        _add_body(asset, world, name, body, hulls, _bits(OBJECT_BIT, HAND_BIT | TABLE_BIT | hits), slick)
-    mount = world
-    for slide in spec.slides:
-        mount = ET.SubElement(mount, "body", name=slide.name, gravcomp="1")
-        _weigh(mount, 1.0, np.zeros(3), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
-        limits = {"axis": format_numbers(slide.axis), "range": format_numbers((slide.lower, slide.upper))}
-        ET.SubElement(mount, "joint", limits, name=slide.name, type="slide")
-    add_links(mount, urdf, spec.world_from_hand, pair_masks(spec.self_pairs, FREE_BIT))
-    for name in movable:
-        add_drive(actuator, name, spec.drives[name])
-    for slide in spec.slides:
-        add_drive(actuator, slide.name, MOUNT_DRIVE)
-    return ET.tostring(root, encoding="unicode")
+    spec.check_drives([joint.name for joint in spec.urdf.movable])
+    names = [OBJECT, *(NEIGHBOUR.format(k) for k in range(len(spec.neighbours)))]
+    bodies = list(zip(names, (spec.body, *spec.neighbours), spec.hulls, strict=True))
+    masks = pair_masks(spec.self_pairs, first=3)  # three bits are of hand, bodies and table
+    return render_mjcf("scene.xml", spec=spec, bodies=bodies, masks=masks, nested=nest_links(spec.urdf))
 
 
-def _add_body(
-    asset: ET.Element, world: ET.Element, name: str, spec: Body, hulls: list[np.ndarray], bits: Mapping[str, str],
-    friction: str,
-) -> None:  # fmt: skip
-    """Add a free body of uniform density, made of convex hulls; `bits` are those of its collision groups.
-
-    A contact has the larger friction of its two bodies, so that a slick body sticks to the hand but not to the table.
-    """
-    body = ET.SubElement(world, "body", name=name)
-    ET.SubElement(body, "freejoint", name=name)
-    _weigh(body, spec.mass, spec.mesh.center_mass, spec.inertia[np.triu_indices(3)])
-    for k, vertices in enumerate(hulls):
-        ET.SubElement(asset, "mesh", name=f"{name}_{k}", vertex=format_numbers(vertices.ravel()))
-        ET.SubElement(body, "geom", dict(bits), type="mesh", mesh=f"{name}_{k}", friction=friction)
+def render_mjcf(template: str, **values: Any) -> str:
+    """Return a model in MJCF from a template of this folder; numbers keep their precision."""
+    filters = {
+        "numbers": format_numbers,
+        "rotation": lambda rpy: rotation_from_rpy(rpy).numpy(),
+        "axes": lambda rotation: rotation[:3, :2].T.ravel(),
+    }
+    path = Path(__file__).parent / "templates" / f"{template}.jinja"
+    return render(path, filters, **values, armature=ARMATURE, mount=MOUNT_DRIVE)
 
 
-def add_links(
-    parent: ET.Element, urdf: Urdf, parent_from_root: np.ndarray, masks: Mapping[str, tuple[int, int]] | None = None
-) -> ET.Element:
-    """Add the links of a hand to a body; return the root's body. `masks` come from `pair_masks`."""
-    masks = masks or {}
-    links = {link.name: link for link in urdf.links}
-    root = _add_link(parent, links[urdf.root], parent_from_root[:3, 3], parent_from_root[:3, :3], masks)
-    bodies = {urdf.root: root}
-    while len(bodies) < len(links):
-        for joint in urdf.joints:
-            if joint.parent in bodies and joint.child not in bodies:
-                body = _add_link(bodies[joint.parent], links[joint.child], joint.xyz, _rotation(joint.rpy), masks)
-                bodies[joint.child] = body
-                if joint.kind != "fixed":
-                    kind = "slide" if joint.kind == "prismatic" else "hinge"
-                    limits = {"axis": format_numbers(joint.axis), "range": format_numbers((joint.lower, joint.upper))}
-                    ET.SubElement(body, "joint", limits, name=joint.name, type=kind, armature=repr(ARMATURE))
-    return root
-
-
-def _add_link(
-    parent: ET.Element, link: Link, place: Iterable[float], rotation: np.ndarray, masks: Mapping[str, tuple[int, int]]
-) -> ET.Element:
-    """Add a link of the hand, with its collision shapes, to the body of its parent; return the link's body."""
-    body = ET.SubElement(parent, "body", _frame(place, rotation), name=link.name, gravcomp="1")
-    if link.mass > 0:
-        _weigh(body, link.mass, link.com, link.inertia)
-    kind, hits = masks.get(link.name, (0, 0))
-    for shape in link.shapes:
-        halves = {"box": (0.5, 0.5, 0.5), "sphere": (1.0,), "cylinder": (1.0, 0.5)}[shape.kind]
-        size = format_numbers(np.multiply(shape.size, halves))
-        frame = _frame(shape.xyz, _rotation(shape.rpy))
-        ET.SubElement(body, "geom", _bits(HAND_BIT | kind, hits) | frame, type=shape.kind, size=size)
-    return body
-
-
-def add_drive(actuator: ET.Element, joint: str, drive: Actuator) -> None:
-    """Add a position servo to a joint of position q: torque kp (target - q) - kd dq/dt, at most the drive's effort."""
-    gains = {"kp": repr(drive.kp), "kv": repr(drive.kd), "forcerange": format_numbers((-drive.effort, drive.effort))}
-    ET.SubElement(actuator, "position", gains, name=joint, joint=joint)
-
-
-def _weigh(body: ET.Element, mass: float, centre: Iterable[float], inertia: Iterable[float]) -> None:
-    """Set a body's mass [kg], centre of mass [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m^2]."""
-    xx, xy, xz, yy, yz, zz = inertia
-    tensor = format_numbers((xx, yy, zz, xy, xz, yz))
-    ET.SubElement(body, "inertial", mass=repr(float(mass)), pos=format_numbers(centre), fullinertia=tensor)
-
-
-def _bits(kind: int, others: int) -> dict[str, str]:
-    """Return MJCF attributes of a shape: the bit of its collision group, and the bits of groups it collides with."""
-    return {"contype": str(kind), "conaffinity": str(others)}
-
-
-def _frame(place: Iterable[float], rotation: np.ndarray) -> dict[str, str]:
-    """Return a pose as MJCF attributes: the position [m], and the first two axes of the rotation matrix."""
-    return {"pos": format_numbers(place), "xyaxes": format_numbers(rotation[:, :2].T.ravel())}
-
-
-def _rotation(rpy: tuple[float, float, float]) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of roll, pitch and yaw [rad]."""
-    return rotation_from_rpy(rpy).numpy()
+def nest_links(urdf: Urdf) -> list[tuple[Link, Joint | None, int]]:
+    """Return all links from the root down, each with its joint and the number of bodies that end with it."""
+    links, waiting = {link.name: link for link in urdf.links}, [(0, urdf.root, None)]
+    found: list[tuple[int, str, Joint | None]] = []
+    while waiting:
+        found.append(waiting.pop())
+        depth, name, _ = found[-1]
+        waiting += [(depth + 1, joint.child, joint) for joint in reversed(urdf.joints) if joint.parent == name]
+    depths = [*(depth for depth, _, _ in found[1:]), 0]
+    return [(links[name], joint, depth - after + 1) for (depth, name, joint), after in zip(found, depths, strict=True)]
 
 
 def format_numbers(numbers: Iterable[float]) -> str:

@@ -1,11 +1,11 @@
-"""The HTML report of one run with pictures, and the template engine of all pages."""
+"""The HTML report of one run with pictures, and the rendering of all pages."""
 
 import base64
-import functools
 import math
 from pathlib import Path
 from typing import Any
 
+from torchgrasp import files
 from torchgrasp.app.report import stills
 from torchgrasp.app.report.canvas import FINGERS
 from torchgrasp.app.report.film import describe_film, draw_film
@@ -13,8 +13,6 @@ from torchgrasp.app.report.run import Run, verdict
 from torchgrasp.app.report.scene import encode_scene
 from torchgrasp.base import count_status
 from torchgrasp.checks import checked
-from torchgrasp.files import write_file
-from torchgrasp.lazy import jinja2
 from torchgrasp.values import Grasps, format_success
 
 Sections = dict[str, list[tuple[str, bytes]]]
@@ -39,7 +37,7 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
     >>> "executable grasp" in write_report(Path(tempfile.mkdtemp(), "report.html"), run).read_text()
     True
     """
-    return write_file(path, format_page(run, draw_pictures(run), view))
+    return files.write_file(path, format_page(run, draw_pictures(run), view))
 
 
 def draw_pictures(run: Run) -> Sections:
@@ -135,15 +133,6 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
     ]
 
 
-@functools.cache
-def templates() -> "jinja2.Environment":
-    """Return the template environment of all pages; every inserted text is escaped."""
-    loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
-    return jinja2.Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
-    )
-
-
 def render(template: str, **values: Any) -> str:
     """Return a page from a template and values; values of type `markupsafe.Markup` are inserted as HTML."""
-    return templates().get_template(template).render(values)
+    return files.render(Path(__file__).parent / "templates" / template, **values)
