@@ -177,6 +177,6 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positiv
             keys.append((f"grasp_{row}_{name}", [*position.tolist(), *quaternion(pose), *joints], control))
     drives = {name: x if kp is None else x._replace(kp=kp) for name, x in hand.actuators.items()}
     known = {"name": hand.name, "nested": nested, "pose": np.eye(4), "order": order, "drives": drives, "keys": keys}
-    root = ET.fromstring(render_mjcf("keyframes.xml", **known))
+    root = ET.fromstring(render_mjcf("robot.xml", **known, free=True))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"

@@ -127,13 +127,13 @@ def _plain(value: Any) -> Any:
 
 def render(template: Path, filters: Mapping[str, Callable[..., object]] | None = None, **values: Any) -> str:
     """Return a text from a template of Jinja and values; texts that are put into HTML or XML are escaped."""
-    engine = _engine(template.parent)
+    engine = template_engine(template.parent)
     engine.filters |= filters or {}
     return engine.get_template(template.name).render(values)
 
 
 @functools.cache
-def _engine(folder: Path) -> "jinja2.Environment":
+def template_engine(folder: Path) -> "jinja2.Environment":
     """Return the template engine of a folder."""
     loader, escape = jinja2.FileSystemLoader(folder), jinja2.select_autoescape(("html", "js", "css", "xml.jinja"))
     return jinja2.Environment(

@@ -205,6 +205,6 @@ def nest_links(urdf: Urdf) -> list[tuple[Link, Joint | None, int]]:
     return [(links[name], joint, depth - after + 1) for (depth, name, joint), after in zip(found, depths, strict=True)]
 
 
-def format_numbers(numbers: Iterable[float]) -> str:
+def format_numbers(numbers: Iterable[float | int]) -> str:
     """Return numbers as the text of an XML attribute, without loss of precision."""
     return " ".join(repr(float(x)) for x in numbers)

@@ -23,7 +23,7 @@ from torchgrasp.evaluation.lift import run_lift
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.sim.mujoco_scene import MujocoScene, add_drive, add_links, format_numbers, scene_mjcf
+from torchgrasp.sim.mujoco_scene import MujocoScene, format_numbers, nest_links, render_mjcf, scene_mjcf
 from torchgrasp.sim.scene_spec import SceneSpec
 
 TRIAL = TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.1, approach=0.1, simulator="mujoco")
@@ -54,11 +54,15 @@ class ArmScene(MujocoScene):
         world.remove(bodies[spec.slides[0].name])
         for servo in [servo for servo in actuator if servo.get("name") in self.mount]:
             actuator.remove(servo)
-        base = add_links(world, self.arm.urdf, self.arm.obj_from_base.numpy())
+        joints = {j.name: Actuator(j.effort, j.velocity, *DRIVES[j.effort]) for j in self.arm.urdf.movable}
+        parts = {"nested": nest_links(self.arm.urdf), "pose": self.arm.obj_from_base.numpy(), "order": [*joints]}
+        model = ET.fromstring(render_mjcf("robot.xml", name="arm", **parts, drives=joints))
+        base, servos = model.find("worldbody/body"), model.find("actuator")
+        assert base is not None and servos is not None
         for joint in base.iter("joint"):
             joint.set("armature", str(ROTOR))
-        for joint in self.arm.urdf.movable:
-            add_drive(actuator, joint.name, Actuator(joint.effort, joint.velocity, *DRIVES[joint.effort]))
+        world.append(base)
+        actuator.extend(servos)
         hand, place = bodies[spec.urdf.root], self.arm.tip_from_hand.numpy()
         hand.attrib |= {"pos": format_numbers(place[:3, 3]), "xyaxes": format_numbers(place[:3, :2].T.ravel())}
         next(body for body in base.iter("body") if body.get("name") == self.arm.urdf.links[-1].name).append(hand)

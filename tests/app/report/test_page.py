@@ -7,11 +7,12 @@ import pytest
 
 from tests.scores import SCORES
 from torchgrasp.app.report.evaluation import format_evaluation, write_evaluation
-from torchgrasp.app.report.page import format_page, grasp_rows, templates, write_report
+from torchgrasp.app.report.page import TEMPLATES, format_page, grasp_rows, write_report
 from torchgrasp.app.report.run import closing_sentence, refusal, verdict
 from torchgrasp.app.report.viewer import write_viewer
 from torchgrasp.errors import OutputError, Status
 from torchgrasp.evaluation.intervals import share_over
+from torchgrasp.files import template_engine
 from torchgrasp.planner.explain import Explanation, Funnel, Losses, Trial
 from torchgrasp.specs import ContactSpec
 
@@ -119,7 +120,7 @@ def test_the_page_of_an_evaluation_shows_shares_objects_and_reasons_and_no_text_
 
 def test_a_bar_ends_where_the_interval_does():
     found = share_over({"tin": (1, 4), "cup": (2, 6)})
-    bar = str(templates().get_template("table.html").module.bar(found))
+    bar = str(template_engine(TEMPLATES).get_template("table.html").module.bar(found))
     ends = [float(x) for x in re.findall(r'x[12]="([\d.]+)"', bar)[2:]]
     at = float(re.findall(r'cx="([\d.]+)"', bar)[0])
     for drawn, value in zip((*ends, at), (found[1], found[2], found[0]), strict=True):

@@ -15,6 +15,7 @@ from torchgrasp.base import count_status
 from torchgrasp.checks import checked
 from torchgrasp.values import Grasps, format_success
 
+TEMPLATES = Path(__file__).with_name("templates")  # of all pages
 Sections = dict[str, list[tuple[str, bytes]]]
 GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
 """Titles of the columns of a table of grasps; errors, angles and standard deviations are those of the worst finger."""
@@ -135,4 +136,4 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 
 def render(template: str, **values: Any) -> str:
     """Return a page from a template and values; values of type `markupsafe.Markup` are inserted as HTML."""
-    return files.render(Path(__file__).parent / "templates" / template, **values)
+    return files.render(TEMPLATES / template, **values)
