@@ -70,25 +70,36 @@ layer("shell").add(
 const deviations = unpack(run.surface.std);
 
 /* Move each vertex outward by `sigma` standard deviations, less where faces would fold: there opposite sides meet. */
+let inflated = 0;
 function inflate(sigma) {
+  if (sigma === inflated) return;
+  inflated = sigma;
   const from = surface.attributes.position.array, to = shell.attributes.position.array, out = surface.attributes.normal.array;
-  const faces = surface.index.array, reach = deviations.map((std) => sigma * std);
+  const faces = surface.index.array, reach = deviations.map((std) => sigma * std), folded = new Uint8Array(reach.length);
   for (let round = 0; round < 40; round++) {
     for (let i = 0; i < to.length; i++) to[i] = from[i] + reach[Math.floor(i / 3)] * out[i];
-    const folded = new Set();
+    folded.fill(0);
     for (let f = 0; f < faces.length; f += 3) {
-      const corners = [faces[f], faces[f + 1], faces[f + 2]], before = turn(from, corners), now = turn(to, corners);
-      if (before.dot(now) < 0.5 * before.length() * now.length()) corners.forEach((vertex) => folded.add(vertex));
+      if (bend(from, to, faces[f], faces[f + 1], faces[f + 2]) < 0.1) folded[faces[f]] = folded[faces[f + 1]] = folded[faces[f + 2]] = 1;
     }
-    if (!folded.size) break;
-    folded.forEach((vertex) => { reach[vertex] *= 0.85; });
+    if (!folded.includes(1)) break;
+    const sum = new Float32Array(reach.length), near = new Float32Array(reach.length);
+    for (let f = 0; f < faces.length; f += 3) {
+      for (let k = 0; k < 3; k++) { sum[faces[f + k]] += reach[faces[f + (k + 1) % 3]]; near[faces[f + k]]++; }
+    }
+    folded.forEach((is, vertex) => { if (is) reach[vertex] = 0.9 * Math.min(reach[vertex], sum[vertex] / near[vertex]); });
   }
   shell.attributes.position.needsUpdate = true;
   shell.computeVertexNormals();
 }
-function turn(points, [a, b, c]) {
-  const at = (k) => new THREE.Vector3().fromArray(points, 3 * k);
-  return at(b).sub(at(a)).cross(at(c).sub(at(a)));
+/* The cosine of the angle by which a face (a, b, c) turns between two lists of positions. */
+function bend(from, to, a, b, c) {
+  const [x, y, z] = turn(from, 3 * a, 3 * b, 3 * c), [u, v, w] = turn(to, 3 * a, 3 * b, 3 * c);
+  return (x * u + y * v + z * w) / (Math.hypot(x, y, z) * Math.hypot(u, v, w) || 1e-30);
+}
+function turn(p, a, b, c) {
+  const x = p[b] - p[a], y = p[b + 1] - p[a + 1], z = p[b + 2] - p[a + 2], u = p[c] - p[a], v = p[c + 1] - p[a + 1], w = p[c + 2] - p[a + 2];
+  return [y * w - z * v, z * u - x * w, x * v - y * u];
 }
 
 const pieces = run.hand.map((piece) => {
