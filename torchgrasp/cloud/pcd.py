@@ -74,32 +74,27 @@ def decompress(data: bytes, size: int) -> bytes:
     A control byte c < 32 is followed by c + 1 literal bytes. A larger c means a copy of (c >> 5) + 2 earlier bytes; a
     length of 9 is extended by the next byte. The distance back to the copied bytes has 13 bits.
     """
-    out, i, end = bytearray(), 0, len(data)
-    while i < end:
-        control = data[i]
-        i += 1
+    out, i = bytearray(), 0
+
+    def take(count: int) -> bytes:
+        nonlocal i
+        i += count
+        if i > len(data):
+            raise Malformed("LZF data that end early")
+        return data[i - count : i]
+
+    while i < len(data):
+        control = take(1)[0]
         if control < 32:
-            length = control + 1
-            if i + length > end:
-                raise Malformed("LZF data that end early")
-            out += data[i : i + length]
-            i += length
+            out += take(control + 1)
         else:
-            length = control >> 5
-            if i + 1 + (length == 7) > end:
-                raise Malformed("LZF data that end early")
-            if length == 7:
-                length += data[i]
-                i += 1
-            length += 2
-            start = len(out) - ((control & 31) << 8) - data[i] - 1
-            i += 1
+            length = (control >> 5) + 2
+            length += take(1)[0] if length == 9 else 0
+            start = len(out) - ((control & 31) << 8) - take(1)[0] - 1
             if start < 0:
                 raise Malformed("LZF data that copy bytes from before their start")
             piece = out[start : start + length]
-            while len(piece) < length:  # the copy overlaps what it writes
-                piece += piece[: length - len(piece)]
-            out += piece
+            out += (piece * (length // len(piece) + 1))[:length]  # the copy may overlap what it writes
         if len(out) > size:
             raise Malformed(f"LZF data of more than {size} bytes")
     if len(out) < size:

@@ -20,20 +20,17 @@ Property = tuple[str, str, str]  # name, type, and type of the length if it is a
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals, viewpoint, frustum and table of a PLY file by name; entries that it lacks are None."""
+    """Return points, normals, viewpoint, frustum and table of a PLY file by name, where it has them."""
     header, body = _split_header(data)
-    encoding, viewpoint, frustum, table = "", None, None, None
+    encoding, known = "", dict[str, np.ndarray]()
+    sizes = {"viewpoint": 3, "frustum": 12, "table": 4}
     elements: list[tuple[str, int, list[Property]]] = []
     for line in header:
         match line.split():
             case ["format", kind, "1.0"]:
                 encoding = kind
-            case ["comment", "viewpoint", x, y, z]:
-                viewpoint = np.array([float(x), float(y), float(z)])
-            case ["comment", "frustum", *numbers] if len(numbers) == 12:
-                frustum = np.array([float(x) for x in numbers]).reshape(4, 3)
-            case ["comment", "table", *numbers] if len(numbers) == 4:
-                table = np.array([float(x) for x in numbers])
+            case ["comment", name, *numbers] if len(numbers) == sizes.get(name):
+                known[name] = np.array([float(x) for x in numbers]).reshape((4, 3) if name == "frustum" else -1)
             case ["element", name, count]:
                 elements.append((name, int(count), []))
             case ["property", "list", length, kind, name] if elements and {length, kind} <= TYPES.keys():
@@ -52,12 +49,12 @@ def parse_ply(data: bytes) -> dict[str, Any]:
         if encoding == "ascii" and len(body) > TEXT_MESH_BYTES:
             raise Malformed(f"a mesh of {len(body)} bytes of text, which may have {TEXT_MESH_BYTES}")
         points, normals = _sample_mesh(data)
-        return {"points": points, "normals": normals, "viewpoint": viewpoint}
+        return {"points": points, "normals": normals, "viewpoint": known.get("viewpoint")}
     if not elements or elements[0][0] != "vertex":
         raise Malformed("a first element that is not called vertex")
     _, count, properties = elements[0]
     found = _read_columns(body, encoding, count, properties, not any(more for _, more, _ in elements[1:]))
-    return {**found, "viewpoint": viewpoint, "frustum": frustum, "table": table}
+    return found | known
 
 
 def format_ply(

@@ -249,6 +249,7 @@ BROKEN = {
     "not a number": (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "obj"),
     "a missing corner": (b"v 0 0 0\nf 1 2 3\n", "obj"),
     "many declared": (b"ply\nformat ascii 1.0\nelement vertex 3\nelement face 99999999999\nend_header\n", "ply"),
+    "scaled twice": (trimesh.creation.box((1e-4, 1e-4, 1e-4)).export(file_type="stl"), "stl"),
     "in millimetres": (trimesh.creation.box((9000, 9000, 9000)).export(file_type="stl"), "stl"),
 }
 

@@ -76,6 +76,10 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
             if not reach <= MAX_EXTENT:
                 wanted = f"shapes that reach at most {MAX_EXTENT:g} m; a mesh in millimetres needs a scale of 0.001"
                 raise urdf.wrong(f"mesh {shape.file!r} that reaches {reach:.3g} m", wanted)
+            if shape.kind == "mesh" and reach < 5e-4:  # thinner than a fingernail
+                raise urdf.wrong(
+                    f"mesh {shape.file!r} that reaches {1e3 * reach:.3g} mm", "metres: scaled twice, or by 0?"
+                )
             pose = pose_of(shape)
             parts.append(local @ pose[:3, :3].T + pose[:3, 3])
         found[link.name] = tuple(parts)
