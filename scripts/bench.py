@@ -1,12 +1,12 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-close  misplaced, sensors, perturb, table-lift, holding, play, speed, success, arm: closing, lifting, exported folders
+close  misplaced, sensors, perturb, table-lift, holding, play, speed, success, arm, where: closing, lifts, exports
 gpu    kernels, clouds, launches, pulls: kernels beside the CPU; many clouds and trials at once; launches, without a GPU
 hand   fk, collision, codes, em: kinematics beside pytorch-kinematics, self-collision, inverse kinematics, learning
 load   plans, trials, points, starts, campaign, scheduler, waiting: memory over many plans and trials, of large inputs;
        what a million views cost; Dask's scheduler with a thousand workers, some of which die, and with waiting jobs
-plan   truth, fields, executable, certificates, pace: contacts on the true surface, exact proofs, time to grasps
+plan   truth, fields, executable, certificates, wrenches, pace: contacts on the true surface, proofs, time to grasps
 scene  plane, click, rooms, real, whole, clutter, clear: depth images, and lifts among neighbours
 shape  objects, weaker: the estimated shape against true meshes
 
