@@ -4,8 +4,11 @@ import ast
 import dataclasses
 import functools
 import json
+import os
+import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +30,28 @@ from torchgrasp.specs import TrialSpec
 CASES = [(name, hand, mass) for mass in (0.25, 4.0) for name in ("jug", "cylinder") for hand in ("allegro", "barrett")]
 """Objects, hands and masses [kg]: the heavy ones are beyond what the joints can press."""
 SPEC = TrialSpec(approach=0.05, hold_time=0.3)
-LIBRARIES = {"mujoco": {"mujoco"}, "maniskill": {"gymnasium", "environment"}, "newton": {"newton", "warp"}}
+LIBRARIES = {
+    "mujoco": {"mujoco", "numpy"},
+    "maniskill": {"gymnasium", "environment", "numpy"},
+    "newton": {"newton", "warp", "numpy"},
+    "isaaclab": {"isaaclab", "numpy", "torch"},
+    "usd": {"pxr"},
+}
+"""What each script imports beside Python's own modules; "environment" is a file of the folder."""
+
+ISAAC_LAB = {
+    "SimulationCfg": {"dt", "gravity", "device"},
+    "RigidBodyMaterialCfg": {"static_friction", "dynamic_friction", "restitution", "friction_combine_mode"},
+    "CuboidCfg": {"size", "collision_props", "physics_material", "rigid_props", "mass_props"},
+    "CollisionPropertiesCfg": {"collision_enabled", "contact_offset", "rest_offset"},
+    "ArticulationRootPropertiesCfg": {"fix_root_link", "enabled_self_collisions", "articulation_enabled"},
+    "UsdFileCfg": {"usd_path", "articulation_props", "rigid_props", "scale", "variants"},
+    "ImplicitActuatorCfg": {"joint_names_expr", "stiffness", "damping", "effort_limit_sim", "armature", "friction"},
+    "ArticulationCfg": {"prim_path", "spawn", "init_state", "actuators"},
+    "InitialStateCfg": {"pos", "rot", "joint_pos", "joint_vel"},
+    "RigidObjectCfg": {"prim_path", "spawn", "init_state"},
+}
+"""Fields of Isaac Lab's configurations that its documentation of version 2.3.2 lists."""
 
 
 def spec_of(mass):
@@ -68,7 +92,37 @@ def test_a_script_is_short_and_needs_the_simulator_and_numpy(player, tmp_path):
     modules = {x.module for x in ast.walk(ast.parse(text)) if isinstance(x, ast.ImportFrom)}
     modules |= {name.name for x in ast.walk(ast.parse(text)) if isinstance(x, ast.Import) for name in x.names}
     assert len(text.splitlines()) <= 40
-    assert {x.split(".")[0] for x in modules} - sys.stdlib_module_names == LIBRARIES[player] | {"numpy"}
+    assert {x.split(".")[0] for x in modules} - sys.stdlib_module_names == LIBRARIES[player]
+
+
+def test_isaac_lab_gets_fields_that_its_documentation_lists(tmp_path):
+    tree = ast.parse((export(tmp_path, "isaaclab", "jug", "barrett", 0.25) / "play.py").read_text())
+    calls = [(getattr(x.func, "attr", getattr(x.func, "id", "")), x) for x in ast.walk(tree) if isinstance(x, ast.Call)]
+    made = {name: {word.arg for word in call.keywords if word.arg} for name, call in calls if name.endswith("Cfg")}
+    assert made.keys() == ISAAC_LAB.keys() and all(made[name] <= ISAAC_LAB[name] for name in made)
+    (pose,) = (x for x in ast.walk(tree) if isinstance(x, ast.Dict) and x.keys[0].value == "pos")
+    assert {key.value for key in pose.keys} <= ISAAC_LAB["InitialStateCfg"]
+
+
+@pytest.mark.sim
+def test_a_scene_in_usd_is_valid_and_plays_in_newton(tmp_path):
+    """OpenUSD reads every body, joint and drive; Newton's reader builds a scene in which the jug is lifted."""
+    folder, python = export(tmp_path, "usd", "jug", "barrett", 0.25), ROOT / ".beside" / "newton" / "bin" / "python"
+    if not python.exists():
+        pytest.skip("scripts/beside makes .beside/newton")
+    words = [str(python), "-W", "ignore", str(Path(__file__).with_name("play_usd.py")), str(folder)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": ""})
+    assert done.returncode == 0, done.stderr
+    found, hand = json.loads(done.stdout.splitlines()[-1]), load_hand("barrett")
+    assert found["valid"] and found["rise"] > 0.5 * SPEC.lift_height
+    play = json.loads((folder / "play.json").read_text())
+    assert found["mass"] == pytest.approx(play["object"]["mass"])
+    for name, drive in hand.actuators.items():
+        joint = found["joints"][name]
+        assert [joint["kp"], joint["kd"], joint["effort"]] == pytest.approx(
+            [drive.kp, drive.kd, drive.effort], rel=1e-5
+        )
+    assert (folder / "motion_0.usda").is_file()
 
 
 def test_the_drives_have_the_effort_limits_of_the_urdf_and_the_gains_of_the_hand(tmp_path):

@@ -1,6 +1,8 @@
 """Folders that play grasps in a simulator: models of hand, object and table, the motion as data, and a short script."""
 
-import xml.etree.ElementTree as ET
+import dataclasses
+import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -15,12 +17,13 @@ from torchgrasp.control.holding import PUSH
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.errors import BadArgument
 from torchgrasp.export.postures import named_postures, quaternion
-from torchgrasp.files import format_json, write_file
-from torchgrasp.geometry.frames import inverse
+from torchgrasp.files import render, write_file
+from torchgrasp.geometry.frames import inverse, rotation_from_rpy
 from torchgrasp.geometry.plane import upright_frame
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.urdf import Joint, Link, Shape
 from torchgrasp.ik.motion import opened_pose
-from torchgrasp.lazy import trimesh
+from torchgrasp.lazy import spatial, trimesh
 from torchgrasp.sim.convex_parts import hull, read_solid
 from torchgrasp.sim.mujoco_scene import scene_mjcf
 from torchgrasp.sim.sapien_bodies import split_hull
@@ -28,8 +31,11 @@ from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, SceneSpec, Slide, m
 from torchgrasp.specs import TrialSpec
 from torchgrasp.values import Grasps
 
-Player = Literal["mujoco", "maniskill", "newton"]
-"""The simulators for which `save_play` writes a folder."""
+Player = Literal["mujoco", "maniskill", "newton", "isaaclab", "usd"]
+"""The simulators and the scene format for which `save_play` writes a folder."""
+TEMPLATES = Path(__file__).parent / "templates"
+USD = {"isaaclab": ("hand.usda", "object.usda"), "usd": ("hand.usda", "object.usda", "scene.usda")}
+"""Files in USD's text format, by player."""
 
 
 @checked
@@ -77,15 +83,18 @@ def save_play(
         solid, *pieces = (body.copy().apply_transform(world_from_obj.numpy()) for body in (solid, *pieces))
     scene = _scene(hand, spec, solid, pieces)
     write_file(folder / "object.ply", _mesh_file(solid, "ply"))
-    write_file(folder / "play.json", format_json(describe_play(hand, grasps, world_from_obj, scene, spec)))
     if player in ("mujoco", "newton"):
-        write_file(folder / "scene.xml", _on_base(scene_mjcf(scene)))
+        write_file(folder / "scene.xml", scene_mjcf(scene))
     elif player == "maniskill":
         write_file(folder / "hand.urdf", mounted_urdf(scene))
         for k, corners in enumerate(some for hull in scene.hulls[0] for some in split_hull(hull)):
             write_file(folder / f"part_{k}.obj", _mesh_file(hull(100.0 * corners), "obj"))
-    for path in (Path(__file__).parent / "templates").glob(f"{player}*.py.txt"):
-        name = path.name.removeprefix(f"{player}").removesuffix(".py.txt").removeprefix("_") or "play"
+    values = _describe(hand, grasps, world_from_obj, scene, spec) | (describe_bodies(scene) if player in USD else {})
+    filters = {"json": json.dumps, "vector": lambda numbers: f"({', '.join(repr(float(x)) for x in numbers)})"}
+    for name in ("play.json", *USD.get(player, ())):
+        write_file(folder / name, render(TEMPLATES / f"{name}.jinja", filters, **values))
+    for path in TEMPLATES.glob(f"{player}*.py.txt"):
+        name = path.name.removeprefix(player).removesuffix(".py.txt").removeprefix("_") or "play"
         write_file(folder / f"{name}.py", path.read_text("utf-8"))
     return folder
 
@@ -126,13 +135,10 @@ def pressing_force(spec: TrialSpec, mass: Positive) -> float:
     return needed if spec.force is None else spec.force
 
 
-def describe_play(
+def _describe(
     hand: Hand, grasps: Grasps, world_from_obj: Float[Tensor, "4 4"], scene: SceneSpec, spec: TrialSpec
 ) -> dict[str, Any]:
-    """Return the content of play.json."""
-    moments, axes = np.linalg.eigh(scene.body.inertia)
-    frame = torch.eye(4, dtype=torch.float64)
-    frame[:3, :3] = torch.from_numpy(axes * [1.0, 1.0, np.sign(np.linalg.det(axes))])
+    """Return the values of play.json."""
     mount = {slide.name: MOUNT_DRIVE for slide in scene.slides}
     masks = pair_masks(scene.self_pairs, first=1)
     _, postures = named_postures(hand, grasps, pressing_force(spec, scene.mass), spec.kp)
@@ -149,32 +155,17 @@ def describe_play(
         "hold": (up, "squeeze", spec.hold_time),
     }
     return {
-        "format": "torchgrasp play",
-        "version": 1,
-        "units": "m, rad, kg, s, N, N m; quaternions are (w, x, y, z)",
-        "frames": "z is up. Joints mount_x, mount_y, mount_z move the hand's root link along its own axes, from its "
-        "pose in the grasp. Each phase ends at its time with its targets; between them targets move smoothly.",
-        "hand": hand.name,
-        "timestep": spec.timestep,
-        "gravity": spec.gravity,
+        "hand": hand.name, "timestep": spec.timestep, "gravity": spec.gravity, "armature": ARMATURE,
         "friction": {"hand": scene.friction, "table": scene.body_friction},
-        "table_height": scene.table_height,
-        "lift_height": spec.lift_height,
-        "object": {
-            "mass": scene.mass,
-            "centre": scene.mesh.center_mass.tolist(),
-            "moments": moments.tolist(),
-            "axes": quaternion(frame),
-        },
-        "armature": ARMATURE,
+        "table_height": scene.table_height, "lift_height": spec.lift_height,
+        "body": {"mass": scene.mass, "centre": scene.mesh.center_mass.tolist(), **_principal(scene.body.inertia)},
         "drives": {name: x._asdict() for name, x in (mount | scene.drives).items()},
-        "collision": {name: list(masks.get(name, (0, 0))) for name in (link.name for link in scene.urdf.links)},
+        "collision": {link.name: masks.get(link.name, (0, 0)) for link in scene.urdf.links},
         "times": dict(zip(motion, np.cumsum([x[2] for x in motion.values()]).tolist(), strict=True)),
         "grasps": [
             {
                 "position": pose[:3, 3].tolist(),
                 "quaternion": quaternion(pose),
-                "success": float(grasps.success[row]),
                 "targets": {
                     phase: dict(zip(mount, (moved[row] @ pose[:3, :3]).tolist(), strict=True))
                     | {joint: float(q[row]) for joint, q in postures[posture].items()}
@@ -183,23 +174,79 @@ def describe_play(
             }
             for row, pose in enumerate(poses)
         ],
-    }
+    }  # fmt: skip
+
+
+def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
+    """Return the principal moments of an inertia (3, 3) [kg m^2], and the quaternion (w, x, y, z) of its axes."""
+    moments, axes = np.linalg.eigh(inertia)
+    return {"moments": moments.tolist(), "axes": _turn(axes * [1.0, 1.0, np.sign(np.linalg.det(axes))])}
+
+
+def _turn(rotation: np.ndarray) -> list[float]:
+    """Return a rotation (3, 3) as a quaternion (w, x, y, z)."""
+    return spatial.transform.Rotation.from_matrix(rotation).as_quat(scalar_first=True).tolist()
+
+
+def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
+    """Return what USD needs: the parts of the object, and links and joints of hand and mount, all joints at zero.
+
+    Raises `BadArgument` for names of links or joints that USD does not allow.
+    """
+    urdf, still = scene.urdf, Link("base", 0.1, (0.0, 0.0, 0.0), (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4), ())
+    names = ["base", *(f"{slide.name}_link" for slide in scene.slides)]
+    joints = [
+        Joint(x.name, "prismatic", parent, child, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), x.axis, x.lower, x.upper)
+        for x, parent, child in zip(scene.slides, names, names[1:], strict=False)
+    ]
+    joints += [Joint("wrist", "fixed", names[-1], urdf.root, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), *urdf.joints]
+    links = [*(dataclasses.replace(still, name=name) for name in names), *urdf.links]
+    if wrong := [x.name for x in (*links, *joints) if not x.name.isidentifier()]:
+        raise BadArgument("hand", f"{wrong[0]!r}", "names of letters, digits and _, which USD allows")
+    poses, left = {"base": np.eye(4)}, list(joints)
+    while left:
+        for joint in [x for x in left if x.parent in poses]:
+            left.remove(joint)
+            poses[joint.child] = poses[joint.parent] @ _pose(joint)
+    meet = {frozenset(pair) for pair in scene.self_pairs}
+    drives = dict.fromkeys((slide.name for slide in scene.slides), MOUNT_DRIVE) | scene.drives
+    xx, xy, xz, yy, yz, zz = range(6)
+    return {
+        "parts": [hull(corners) for corners in scene.hulls[0]],
+        "links": [
+            {
+                "name": link.name, "mass": link.mass, "centre": link.com,
+                "place": poses[link.name][:3, 3], "rotation": _turn(poses[link.name][:3, :3]),
+                "passes": [x.name for x in links[k + 1 :] if frozenset((x.name, link.name)) not in meet],
+                "shapes": [vars(x) | {"place": x.xyz, "rotation": _turn(_pose(x)[:3, :3])} for x in link.shapes],
+                **_principal(np.array(link.inertia)[[[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]]),
+            }
+            for k, link in enumerate(links)
+        ],
+        "joints": [
+            vars(x) | {
+                "place": x.xyz, "axis": _turn(_along(x.axis)), "rotation": _turn(_pose(x)[:3, :3] @ _along(x.axis)),
+                "drive": None if x.kind == "fixed" else drives[x.name], "armature": ARMATURE * (x in urdf.joints),
+                "degrees": math.degrees(1.0) if x.kind == "revolute" else 1.0,
+            }
+            for x in joints
+        ],
+    }  # fmt: skip
+
+
+def _pose(of: "Joint | Shape") -> np.ndarray:
+    """Return the pose (4, 4) of a joint or a shape in its link."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_from_rpy(of.rpy).numpy(), of.xyz
+    return pose
+
+
+def _along(axis: Sequence[float]) -> np.ndarray:
+    """Return a rotation (3, 3) that turns the x axis to a unit axis."""
+    return spatial.transform.Rotation.align_vectors([axis], [(1.0, 0.0, 0.0)])[0].as_matrix()
 
 
 def _mesh_file(mesh: "trimesh.Trimesh", kind: str) -> bytes:
     """Return the content of a mesh's file of a kind, as "ply"."""
     content = mesh.export(file_type=kind)
     return content if isinstance(content, bytes) else str(content).encode()
-
-
-def _on_base(mjcf: str) -> str:
-    """Return a model in MJCF whose hand is on a body "base" that a script can place."""
-    root = ET.fromstring(mjcf)
-    world = root.find("worldbody")
-    assert world is not None
-    mount = world.find("body[@name='mount_x']")
-    assert mount is not None
-    world.remove(mount)
-    ET.SubElement(world, "body", name="base").append(mount)
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode") + "\n"

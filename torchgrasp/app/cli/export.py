@@ -46,20 +46,21 @@ class Export(Command):
     """Write the best executable grasps of a file for other programs, with frames and the order of joints."""
 
     grasps: Path = positional("grasps.safetensors of `torchgrasp grasp`, or a file of the folder grasps of `evaluate`")
-    out: Path = required("file to write; for dexgraspbench and play-... a folder")
+    out: Path = required("file to write; for dexgraspbench, play-... and usd a folder")
     format: Literal[
         "json", "mujoco", "moveit", "ros2", "dexgraspbench", "graspgen", "glb",
-        "play-mujoco", "play-maniskill", "play-newton",
+        "play-mujoco", "play-maniskill", "play-isaaclab", "play-newton", "usd",
     ] = option(
         "json",
         "json: frames, units, forces and torques. mujoco: the hand as a model with keyframes. moveit: a list of "
         "moveit_msgs/Grasp in YAML. ros2: a JointTrajectory each. dexgraspbench, graspgen: files of these projects. "
-        "glb: hand and object at the best grasp, for slides. play-...: hand, object, motion and a script that plays it",
+        "glb: hand and object at the best grasp, for slides. play-..., usd: hand, object, motion, and a script to play",
     )  # fmt: skip
     hand: str | None = option(None, "name or folder of the hand; by default the name in the file")
     most: Count = option(20, "number of grasps, the best first")
     force: float | None = option(
-        None, "normal force of the strongest finger [N] in the squeeze; by default 4, in play-... what the mass needs"
+        None,
+        "normal force of the strongest finger [N] in the squeeze; by default 4, in play-... and usd as --mass needs",
     )
     kp: float | None = option(
         None, "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's"
@@ -67,10 +68,10 @@ class Export(Command):
     object: str | None = option(
         None,
         "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the object's id; "
-        "glb, play-...: a mesh, or the cloud of the plan for its estimated surface; by default surface.ply of GRASPS",
+        "glb, play-..., usd: a mesh, or the plan's cloud for the estimated surface; by default surface.ply of GRASPS",
     )
-    mass: float = option(0.1, "play-...: mass of the object [kg]")
-    friction: float = option(0.8, "play-...: coefficient of friction")
+    mass: float = option(0.1, "play-..., usd: mass of the object [kg]")
+    friction: float = option(0.8, "play-..., usd: coefficient of friction")
     rename: tuple[str, ...] = option(
         (), "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file of such an object"
     )
@@ -81,7 +82,7 @@ class Export(Command):
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return the exit code."""
-        plays, shown = self.format.startswith("play-"), self.grasps.with_name("surface.ply")
+        plays, shown = self.format == "usd" or self.format.startswith("play-"), self.grasps.with_name("surface.ply")
         named = plays or self.format in ("dexgraspbench", "graspgen", "glb")
         found = (plays or self.format == "glb") and shown.is_file()
         if named and self.object is None and not found:
