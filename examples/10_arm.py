@@ -1,6 +1,10 @@
 """A real arm: grasps that a UR5e with an Allegro hand reaches, and the joint trajectory of both.
 
-Here the URDF is made from the published Denavit-Hartenberg parameters, with a cylinder around each link.
+Here the URDF is made from the published Denavit-Hartenberg parameters, with a cylinder around each link. A maker's URDF
+has meshes: `torchgrasp.app.author.clean_arm` replaces them. With the network and `pip install robot_descriptions`:
+
+    from robot_descriptions import panda_description as found  # or ur5e_description, iiwa14_description
+    file.write_text(clean_arm(found.URDF_PATH, meshes=found.REPOSITORY_PATH))
 """
 
 import math

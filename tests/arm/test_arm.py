@@ -5,9 +5,11 @@ import re
 import numpy as np
 import pytest
 import torch
+import trimesh
 from benchmarks.ur5e import by_products, ur5e, ur5e_urdf
 
 from tests.make import random_motion
+from torchgrasp.app.author import clean_arm
 from torchgrasp.arm import load_arm
 from torchgrasp.arm.reach import measure_ease, reach_poses
 from torchgrasp.errors import BadArgument, HandFileError
@@ -72,3 +74,20 @@ def test_files_that_are_no_arm_are_refused(hand, tmp_path):
         load(re.sub(r"(elbow_link.*?)<cylinder[^>]*>", r'\1<mesh filename="elbow.stl"/>', good, count=1))
     with pytest.raises(HandFileError, match="urdf"):
         load("<robot")
+
+
+def test_a_published_arm_with_meshes_is_cleaned_for_the_library(hand, tmp_path):
+    """The forearm becomes a mesh; the spheres of the arm that is read again cover its vertices to a centimetre."""
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
+    body = trimesh.creation.capsule(0.35, 0.045).apply_transform(turn).apply_translation([-0.375, 0, 0.007])
+    body.export(tmp_path / "forearm.stl")
+    mesh = '<geometry><mesh filename="package://any/forearm.stl"/></geometry></collision></link>'
+    text = re.sub(r'(name="elbow_link".*?<collision>).*?</link>', rf"\1{mesh}", ur5e_urdf(), count=1)
+    (tmp_path / "published.urdf").write_text(text)
+    with pytest.raises(HandFileError, match="clean_arm"):
+        load_arm(tmp_path / "published.urdf", hand)
+    (tmp_path / "arm.urdf").write_text(clean_arm(tmp_path / "published.urdf"))
+    arm = load_arm(tmp_path / "arm.urdf", hand)
+    mine = arm.link == arm.tree.link_names.index("elbow_link")
+    far = torch.cdist(torch.from_numpy(np.array(body.vertices)), arm.center[mine]) - arm.radius[mine]
+    assert mine.sum() > 4 and far.amin(1).max() < 0.002

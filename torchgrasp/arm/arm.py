@@ -137,7 +137,9 @@ def load_arm(
         whole, links=(named[whole.root], *(named[j.child] for j in reversed(way))), joints=tuple(reversed(way))
     )
     if bare := [link.name for link in chain.links if any(shape.kind == "mesh" for shape in link.shapes)]:
-        raise whole.wrong(f"link {bare[0]} with a mesh", "boxes, cylinders or spheres")
+        raise whole.wrong(
+            f"link {bare[0]} with a mesh", "boxes, cylinders or spheres, as torchgrasp.app.author.clean_arm writes"
+        )
     tree, joints, one = (
         tree_from_urdf(chain),
         chain.movable,
@@ -161,7 +163,7 @@ def load_arm(
 
 def _spheres(chain: Urdf, hand: Hand, tip_from_hand: Float[Tensor, "4 4"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return link, centre [m] and radius [m] of spheres around an arm's links and the hand's palm, and a palm mask."""
-    cell, bulge = 0.075, 0.01  # [m]: one sphere fills a section of most links; how far it may stand out of a shape
+    cell, bulge = 0.065, 0.01  # [m]: one sphere fills a section of a thin link; how far it may stand out of a shape
     covers = [(k, *cover(shape, cell, bulge)) for k, link in enumerate(chain.links) for shape in link.shapes]
     rows = [(k, *centre, radius) for k, centres, radius in covers for centre in centres]
     palm = hand.collision_spheres.finger == -1

@@ -187,7 +187,6 @@ class Planner:
     def _on_fixed_contacts(self, found: SeededContacts, steps: int) -> tuple[Owned, SeededContacts, Owned]:
         """Return grasps on fixed contacts, the contact sets without a grasp, and their best failed grasps."""
         reach = self.stack.reach(found.contacts, found.certificate, found.owner)
-        found = found._replace(seeds=reach.drop_unreachable(found.seeds))
         grasps, row = best_grasps(try_best_seeds(reach, found.seeds, steps))
         solved, every = executable(grasps), Owned(grasps, found.owner[row])
         return every.select(solved), found.select(row[~solved]), every.select(~solved)

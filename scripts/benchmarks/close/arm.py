@@ -164,7 +164,7 @@ def arm(o: Options) -> list[Row]:
     risen = [(x.free_risen, x.carried_risen) for x in lifts]
     held = [(x.free == "OK", x.carried == "OK") for x in lifts]
     rows = [_share("risen", risen, lifts), _share("held without slip", held, lifts)]
-    ratio = seconds[0] / seconds[1]
+    ratio = float(seconds[0] / seconds[1])
     words = f"{ratio:.2f} ({seconds[0]:.0f} s, without {seconds[1]:.0f} s); no grasp: {', '.join(empty) or 'none'}"
     return [*rows, Row("time of a plan with the arm", f"<= {SLOWEST}", words, ratio <= SLOWEST, {"ratio": ratio})]
 

@@ -123,6 +123,22 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
     return Draft(toml, _render("hand.urdf", urdf=clean, sizes=SIZES) if repairs else "", tuple(repairs))
 
 
+@checked
+def clean_arm(path: Path | str, meshes: Path | str | None = None) -> str:
+    """Return the URDF of a published arm with boxes and cylinders instead of meshes, as `load_arm` needs it.
+
+    The meshes lie below the folder `meshes`, by default that of the URDF. A joint without limits gets half a turn
+    either way. Raises the errors of `new_hand`.
+
+    >>> from torchgrasp import load_hand
+    >>> clean_arm(load_hand("barrett").urdf_path).splitlines()[0]
+    '<robot name="barrett">'
+    """
+    urdf, _ = repair_joints(read_published(path))
+    clean, _ = replace_meshes(urdf, shape_points(urdf, Path(meshes or urdf.path.parent)))
+    return _render("hand.urdf", urdf=clean, sizes=SIZES)
+
+
 def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4 _ n"]:
     """Return the poses (3 x 4) of some links in random postures, computed in chunks to bound the memory."""
     tree, at = tree_from_urdf(urdf), [[x.name for x in urdf.links].index(link) for link in links]
