@@ -17,7 +17,7 @@ from torchgrasp.app.report.glb import write_glb
 from torchgrasp.checks import Count
 from torchgrasp.cloud import read_cloud
 from torchgrasp.cloud.agreement import check_agreement
-from torchgrasp.errors import BadArgument, MeshError, ModelFileError, Status
+from torchgrasp.errors import BadArgument, ModelFileError, Status
 from torchgrasp.export.foreign import Quaternion, read_poses
 from torchgrasp.files import read_json, write_file
 from torchgrasp.geometry.mesh import read_mesh
@@ -130,10 +130,8 @@ class Export(Command):
             cloud = read_cloud(path)
             if digest(cloud) == planned.meta.get("cloud_sha256"):
                 return extract_surface(fit_shape(cloud, seed=int(planned.meta["seed"]), table=planned.table))
-        try:
+        with naming(mesh="--object (a mesh, or the cloud of the plan)"):
             return read_mesh(path)
-        except MeshError as error:
-            raise BadArgument("--object", error.found, f"{error.allowed}, or the cloud of the plan") from error
 
 
 def read_names(words: Sequence[str]) -> dict[str, str] | None:

@@ -22,7 +22,6 @@ from torchgrasp.geometry.plane import upright_frame
 from torchgrasp.lazy import spatial
 
 ROOT = "world/obj"  # entity of the frame of the cloud, in which all poses of grasps are
-CLOUD = "#c2452d"  # colour of the cloud, as on the page
 Index = tuple[str, str, np.ndarray]
 """A timeline: its name, "sequence" or "duration", and its values."""
 
@@ -37,12 +36,6 @@ def write_recording(path: Path | str, run: Run) -> Path:
     as in the simulation, `closing/forces` are the forces on the object, 1 cm for each newton, and `force/FINGER` [N]
     are curves. Returns the path. Raises `MissingExtra` without Rerun, `OutputError` if the file cannot be written.
 
-    >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
-    >>> from torchgrasp.shape import extract_surface
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> jug, hand = load_object("jug"), load_hand("barrett")
-    >>> surface, grasps = extract_surface(fit_shape(jug.view), 24), load_shipped_grasp("jug", "barrett")
-    >>> run = Run("jug", Path("jug.ply"), jug.view, hand, ContactSpec(), surface, grasps)
     >>> write_recording("run.rrd", run)  # doctest: +SKIP
     """
     recorder = _Recorder(run)
@@ -80,7 +73,7 @@ class _Recorder:
         frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._log(ROOT, rr.Transform3D(translation=to_array(frame[:3, 3]), quaternion=_quaternions(frame)))
-        self._log(f"{ROOT}/cloud", rr.Points3D(to_array(run.cloud.points), colors=_bytes(CLOUD)))
+        self._log(f"{ROOT}/cloud", rr.Points3D(to_array(run.cloud.points), colors=_bytes("#c2452d")))
         std_m = to_array(run.surface.std_m)
         shades = np.uint8(255 * map_colors(std_m / max(float(np.quantile(std_m, 0.99)), 1e-6), "viridis"))
         solid = to_array(run.surface.vertices), run.surface.faces.cpu().numpy(), to_array(run.surface.normals)
