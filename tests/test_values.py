@@ -8,13 +8,16 @@ import pickle
 import numpy as np
 import pytest
 import torch
+import yourdfpy
 
 from tests.make import see
 from tests.pinch import pinch
 from torchgrasp import load_object
 from torchgrasp.base import Value, check_whole, count_status, join, pick, put
+from torchgrasp.data import load_shipped_grasp
 from torchgrasp.errors import BadArgument, FailedRows, Status, TooFewPoints
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.hand.load import hand_of
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Certificate, ContactPlan, Contacts, PointCloud
 
@@ -220,3 +223,33 @@ def test_what_is_no_value_of_numbers_is_equal_to_itself_alone():
     jug = load_object("jug")
     assert jug == jug and jug != load_object("jug") and hash(jug) == hash(jug)
     assert torch.equal(copy.deepcopy(jug).view.points, jug.view.points)
+
+
+def test_the_best_grasp_is_the_first_executable_one_or_the_reasons():
+    grasp = pinch("allegro")[1]
+    three = dataclasses.replace(
+        grasp[[0, 0, 0]], status=torch.tensor([13, 0, 0]), score=torch.tensor([9.0, 2.0, 1.0]).double()
+    )
+    assert three.best == three[1] and float(three.best.score) == 2.0
+    with pytest.raises(FailedRows, match=Status.NOT_CLOSED.sentence[:30]):
+        three[:1].best
+    with pytest.raises(FailedRows, match="explain_empty"):
+        three[:0].best
+    with pytest.raises(FailedRows, match="too small"):
+        dataclasses.replace(three[:0], meta={"refused": "too small"}).best
+
+
+def test_the_text_of_grasps_begins_with_what_a_user_asks_first():
+    grasps = load_shipped_grasp("jug", "barrett")[[0, 0]]
+    assert repr(grasps).startswith("Grasps(2 of 2 executable, best predicted success 94%, hand barrett, joints=")
+    assert repr(grasps[:0]).startswith("Grasps(0 of 0 executable, hand barrett, ")
+
+
+def test_the_joints_of_a_hand_are_all_joints_of_its_urdf_and_the_finger_that_rests_is_parked():
+    """Sixteen of the Allegro, of which a grasp of three fingers moves twelve."""
+    grasp = load_shipped_grasp("jug", "allegro")
+    hand = hand_of(grasp)
+    robot = yourdfpy.URDF.load(hand.urdf_path, load_meshes=False, build_scene_graph=False)
+    joints = hand.expand(grasp.joints[0])
+    assert len(joints) == 16 and set(joints) == set(robot.actuated_joint_names) > set(hand.joint_names)
+    assert [float(joints[name]) for name in hand.joint_names] == grasp.joints[0].tolist()

@@ -83,9 +83,13 @@ class Value:
     def __repr__(self) -> str:
         """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small tensors."""
         fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
-        parts = [f"{f.name}={_short(getattr(self, f.name))}" for f in fields]
+        parts = [*self._about(), *(f"{f.name}={_short(getattr(self, f.name))}" for f in fields)]
         lines = textwrap.wrap(f"{type(self).__name__}({', '.join(parts)})", 110, subsequent_indent="    ")
         return "\n".join(lines if len(lines) <= 12 else [*lines[:11], "    ...)"])
+
+    def _about(self) -> list[str]:
+        """Return what the text of a value begins with, before the fields."""
+        return []
 
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
         """Return the value on another device or in another floating dtype; integer tensors keep their dtype.

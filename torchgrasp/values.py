@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgrasp.base import FINGERTIPS, Batch, Value, named_tensors, read_rows
 from torchgrasp.checks import ANY, Poses, Rows, checked, is_rigid
-from torchgrasp.errors import BadArgument, ModelFileError, Status, TooFewPoints
+from torchgrasp.errors import BadArgument, FailedRows, ModelFileError, Status, TooFewPoints
 from torchgrasp.files import read_value, save_tensors
 from torchgrasp.geometry.plane import Plane, read_plane
 
@@ -228,6 +228,9 @@ class Grasps(Batch):
     None means for all. `meta` holds names, units, hashes and the seed as text. With an arm, `arm` are its joints [rad],
     and `ease` its least joint margin and manipulability on the way (`torchgrasp.arm.ArmPath`).
 
+    Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are its joints. For all
+    joints of the hand see `Hand.expand`, for a 3D page `torchgrasp.app.report.show_grasps`.
+
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> grasp.joints.shape, f"{float(grasp.success):.2f}", grasp.tip_error < 0.001  # [m]
@@ -258,6 +261,19 @@ class Grasps(Batch):
         likely = torch.sigmoid(self.score)
         likely = likely if self.known is None else torch.where(self.known, likely, torch.nan)
         return torch.where(self.status == Status.OK, likely, 0.0)
+
+    @property
+    def best(self) -> "Grasps":
+        """The first executable grasp, a batch of one. Raises `FailedRows` with the reasons if there is none."""
+        good = self.status == Status.OK
+        if not len(self):
+            raise FailedRows(self.meta.get("refused", "there is no grasp: explain_empty tells why"))
+        return self[good][:1] if bool(good.any()) else self.raise_for_status()
+
+    def _about(self) -> list[str]:
+        good = self[self.status == Status.OK]
+        best = [f"best predicted success {format_success(good)}"] if len(good) else []
+        return [f"{len(good)} of {len(self)} executable", *best, f"hand {self.meta.get('hand', 'unknown')}"]
 
     @property
     def table(self) -> Plane | None:

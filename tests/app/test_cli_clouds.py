@@ -15,7 +15,15 @@ from tests.make import box
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasps
 from torchgrasp.app.cli.inputs import CloudOptions, ViewOptions
-from torchgrasp.cloud import look_at, partial_view, read_cloud, read_cloud_file, save_cloud
+from torchgrasp.cloud import (
+    diagnose_cloud,
+    estimate_normals,
+    look_at,
+    partial_view,
+    read_cloud,
+    read_cloud_file,
+    save_cloud,
+)
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.cloud.check import remove_outliers
 from torchgrasp.cloud.tables import read_image
@@ -577,3 +585,15 @@ def test_a_cloud_that_gives_no_scene_is_refused_in_one_sentence(name, tmp_path, 
     np.save(tmp_path / "f.npy", np.random.default_rng(0).random((90, 3)))
     (tmp_path / "g.pcd").write_bytes(b"x")
     assert refusal("cloud", "scene", tmp_path / file, *options, "--out", tmp_path / "s.npz").startswith(words)
+
+
+def test_normals_without_a_camera_are_planned_and_the_check_says_so(tmp_path, capsys):
+    """Of one view the check and the planner estimate the camera; a whole surface has none."""
+    seen = estimate_normals(load_object("jug").view)
+    save_cloud(PointCloud(seen.points, seen.normals), path := tmp_path / "normals.npz")
+    assert cli.main(["cloud", "check", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"viewpoint +estimated, .*100% of the normals", said) and "refused" not in said
+    assert fit_shape(read_cloud(path)).kind != "whole"
+    ball = torch.nn.functional.normalize(torch.randn(600, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    assert diagnose_cloud(PointCloud(0.04 * ball, ball)).viewpoint is None

@@ -12,7 +12,7 @@ from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, is_flat, nearest
-from torchgrasp.cloud.prepare import MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
+from torchgrasp.cloud.prepare import FACING, MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
@@ -76,10 +76,11 @@ def diagnose_cloud(
     if check is not None and not check.oriented:
         view = PointCloud(view.points, None, view.viewpoint)
     vertical, guessed, angle = unit(vertical.double()), view, 0.0
-    if view.viewpoint is None and view.normals is None:
+    if view.viewpoint is None:
         seen = view.points.double()[find_inliers(view.points.double())]
-        eye, angle = guess_viewpoint(seen, fit_planes(seen)[0], vertical, assumed=up is None)
-        guessed = dataclasses.replace(view, viewpoint=eye.to(view.points))
+        eye, likely = guess_viewpoint(seen, fit_planes(seen)[0], vertical, assumed=up is None)
+        if view.normals is None or share_facing(view.points, view.normals, eye.to(view.points)) >= FACING:
+            guessed, angle = dataclasses.replace(view, viewpoint=eye.to(view.points)), likely
     clean = clean_cloud(guessed)
     # Clean normals face the viewpoint by construction; given normals may be those of a whole surface.
     judged = clean if view.normals is None else view

@@ -166,7 +166,15 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
-        """Return the positions of all movable joints of the URDF by name, given the actuated joints."""
+        """Return the positions of all movable joints of the URDF by name, given the actuated joints.
+
+        A grasp of three fingers of the Allegro has twelve joints; here are also those of the finger that it leaves out.
+
+        >>> from torchgrasp import load_hand
+        >>> from torchgrasp.data.shipped import load_shipped_grasp
+        >>> len(load_hand("allegro").expand(load_shipped_grasp("jug", "allegro").joints[0]))
+        16
+        """
         return dict(zip(self.tree.joint_names, self.expand_joints(joints).unbind(-1), strict=True))
 
     @checked(gradients=True)

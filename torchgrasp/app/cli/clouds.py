@@ -52,8 +52,8 @@ def _no_view(cloud: PointCloud) -> BadArgument | None:
     some = cloud.select(draw_rows(len(cloud), 20_000))  # more points give no more certainty
     try:
         seen = prepare_cloud(some, torch.Generator().manual_seed(0))
-        if seen.viewpoint is not None:
-            silhouettes(seen.cloud)
+        if seen.one_sided:
+            silhouettes(PointCloud(seen.points, seen.normals, seen.viewpoint))
     except BadArgument as error:
         return error
     return None

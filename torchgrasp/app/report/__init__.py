@@ -6,6 +6,9 @@ from torchgrasp.app.report.page import write_report
 from torchgrasp.app.report.recording import write_recording
 from torchgrasp.app.report.run import Run
 from torchgrasp.app.report.scene import draw_scene
-from torchgrasp.app.report.viewer import write_viewer
+from torchgrasp.app.report.viewer import show_grasps, write_viewer
 
-__all__ = ["Run", "draw_scene", "write_evaluation", "write_glb", "write_recording", "write_report", "write_viewer"]
+__all__ = [
+    "Run", "draw_scene", "show_grasps", "write_evaluation", "write_glb", "write_recording", "write_report",
+    "write_viewer",
+]  # fmt: skip

@@ -5,6 +5,8 @@ import functools
 import hashlib
 import json
 import re
+import tempfile
+import webbrowser
 import zipfile
 from importlib import resources
 from pathlib import Path
@@ -24,11 +26,16 @@ from torchgrasp.app.report.stills import facing, to_array, view_of
 from torchgrasp.checks import checked
 from torchgrasp.closure import ClosureResult
 from torchgrasp.control.forces import squeeze
+from torchgrasp.data.accept import CloudLike, HandLike, as_cloud
 from torchgrasp.files import write_file
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import upright_frame
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import hand_of
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.specs import ContactSpec
 from torchgrasp.values import Grasps
 
 VIEW = "view.html"  # name of the page beside the report
@@ -58,6 +65,27 @@ def write_viewer(path: Path | str, run: Run) -> Path:
     True
     """
     return write_file(path, format_viewer(run))
+
+
+@checked
+def show_grasps(cloud: CloudLike, grasps: Grasps, hand: HandLike | None = None, browser: bool = True) -> Path:
+    """Write the 3D page of grasps to a temporary file, open it in the browser, and return its path.
+
+    `cloud` is that of the plan, as in `plan_grasps`; the page's surface is estimated anew. `hand` is needed for grasps
+    of a hand that is not shipped. Without a `browser` the page is only written.
+
+    >>> from torchgrasp import load_object
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> show_grasps(load_object("jug"), load_shipped_grasp("jug", "barrett"), browser=False).name
+    'view.html'
+    """
+    cloud, table = as_cloud(cloud, "cloud"), grasps.table
+    surface, spec = extract_surface(fit_shape(cloud, table=table)), ContactSpec(table=table)
+    path = Path(tempfile.mkdtemp(), "view.html")
+    write_viewer(path, Run("object", path, cloud, hand_of(grasps, hand), spec, surface, grasps))
+    if browser:
+        webbrowser.open(path.as_uri())
+    return path
 
 
 def format_viewer(run: Run) -> str:
