@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,7 @@ from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, is_
 from torchgrasp.cloud.prepare import FACING, MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.errors import BadArgument
+from torchgrasp.files import render
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values import PointCloud
@@ -115,33 +117,7 @@ def format_report(report: CloudReport) -> str:
     >>> print(format_report(diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3)))).splitlines()[0])
     points      500
     """
-    copies = f" ({report.copies} of them copies)" * bool(report.copies)
-    part = report.measured + report.copies < report.points
-    sample = f"; {report.measured} of them, drawn at random, are measured" * part
-    sides = " x ".join(f"{1e3 * s:.0f}" for s in report.size)
-    check, normals = report.normals, "none; planes are fitted"
-    if check is not None and check.oriented:
-        scaled = f", {check.scaled} not of unit length" * bool(check.scaled)
-        normals = f"given, {int(check.flipped.sum())} look flipped{scaled}"
-    elif check is not None:
-        normals = f"given, of random signs ({check.opposed:.0%} of neighbours are opposite); ignored"
-    viewpoint = "none; the normals tell inside from outside"
-    if report.viewpoint is not None:
-        cameras = report.viewpoint.reshape(-1, 3).unique(dim=0).tolist()
-        places = " and ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in cameras)
-        origin = "given" if report.viewpoint_given else "estimated"
-        viewpoint = f"{origin}, {places} m; {report.facing:.0%} of the normals face it"
-    lines = [
-        ("points", f"{report.points}{copies}{sample}"),
-        ("size", f"{sides} mm, if the numbers are metres"),
-        ("spacing", f"{1e3 * report.spacing:.2g} mm, {1e-4 * report.density:.3g} points per cm2"),
-        ("noise", f"{1e3 * report.noise:.2g} mm about local planes"),
-        ("outliers", f"{report.outliers} ({100 * report.outliers / report.points:.1f} %)"),
-        ("normals", normals),
-        ("viewpoint", viewpoint),
-    ]
-    lines += [("refused" if advice.refused else "advice", str(advice)) for advice in report.advice]
-    return "\n".join(f"{name:12}{text}" for name, text in lines)
+    return render(Path(__file__).parent / "templates" / "report.txt.jinja", report=report)
 
 
 def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.base import check_device, settle
 from torchgrasp.checks import Range, checked
 from torchgrasp.closure import ClosingOptions, choose_options
-from torchgrasp.control.holding import ForceHold, GripHold, PositionHold
+from torchgrasp.control.holding import ForceHold, GripHold, keep_targets
 from torchgrasp.control.object_pose import Touches
 from torchgrasp.control.paper.closings import Impedance, OpenLoopClosing, PaperClosing, PositionClosing
 from torchgrasp.control.paper.stability import load_stability
@@ -262,4 +262,4 @@ def choose_holding(
     if mode == "impedance":
         hand.require_three("holding", "'impedance', whose virtual frame is of three,")
         return functools.partial(Impedance, stability=load_stability(hand))
-    return {"force": ForceHold, "grip": GripHold, "position": PositionHold}.get(mode)
+    return {"force": ForceHold, "grip": GripHold, "position": keep_targets}.get(mode)

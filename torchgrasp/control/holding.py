@@ -1,6 +1,7 @@
 """Hold controllers: press with balanced forces at the contacts, or with the least forces that carry the sensed load."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -47,15 +48,9 @@ class ForceHold:
         return self.start + share * (self.rest + self.factor * self.lead - self.start)
 
 
-class PositionHold:
-    """Keep the joint targets that the hand had at the end of the closing."""
-
-    def __init__(self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]) -> None:
-        self.start = start
-
-    def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
-        return self.start
+def keep_targets(reference: ClosingReference, observation: Observation, start: Tensor) -> Callable[..., Tensor]:
+    """Return the hold that keeps the joint targets of the closing's end, `start` [rad]."""
+    return lambda observation, period: start
 
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:

@@ -1,7 +1,10 @@
 """Export of grasps as postures of named joints: plain JSON, and keyframes of a MuJoCo model."""
 
+import json
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -20,20 +23,7 @@ from torchgrasp.lazy import spatial
 from torchgrasp.sim.mujoco_scene import nest_links, render_mjcf
 from torchgrasp.values import Grasps
 
-CONVENTIONS = {
-    "units": {"length": "m", "angle": "rad", "force": "N", "torque": "N m", "stiffness": "N m/rad", "time": "s"},
-    "frames": {
-        "object": "the frame of the cloud that the grasp was planned on",
-        "hand": "the root link of the hand's URDF",
-    },
-    "pose": "position p and unit quaternion (w, x, y, z) of the hand in the object's frame: x_object = R x_hand + p",
-    "approach": "unit direction in the object's frame in which the opened hand comes to its pose, by the distance",
-    "rise": "displacement of the hand from its pose until it closes, so that opened fingers are not in the table",
-    "flange": "pose of the robot's flange in the object's frame, where the robot's was given",
-    "joints": "by the names of the hand's URDF or of `rename`, all that move: actuated, coupled and parked",
-    "squeeze": "targets of position-controlled joints: stiffness (squeeze - grasp) = torque = J^T force",
-    "force": "of the fingertip on the object at its contact, in the object's frame",
-}
+CONVENTIONS: dict[str, Any] = json.loads((Path(__file__).parent / "templates" / "conventions.json").read_text("utf-8"))
 """Meaning of the numbers in a JSON file of grasps; the file contains this text."""
 TASK = "task_margin", "task_load", "task_twist", "task_forces", "task_strength"
 """Fields of the `Certificate`, which explains them, that stand in the file if grasps were planned with `resist`."""

@@ -203,14 +203,6 @@ def closure_probability(
     return ClosureProbability(share, torch.sqrt(middle * (1 - middle) / n))
 
 
-def closure_share(shape: ShapeGP, contacts: Contacts, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the fraction of n random surfaces on which each contact set has force closure; 0 at the domain's edge."""
-    inside = well_inside(shape, contacts)
-    share = contacts.points.new_zeros(len(contacts))
-    share[inside] = closed_share(line_posterior(shape, contacts[inside]), friction, n, seed).to(share)
-    return share
-
-
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
     """Return the fraction of n random surfaces, drawn on `lines`, on which each contact set has force closure."""
     draws_per_chunk = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB

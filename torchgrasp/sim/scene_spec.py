@@ -8,12 +8,12 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from torchgrasp.checks import checked
 from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.files import render
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.lazy import trimesh
@@ -190,24 +190,10 @@ def mounted_urdf(spec: SceneSpec) -> str:
     for joint in robot.iter("joint"):
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)
-    roll, pitch, yaw = euler_from_rotation(spec.world_from_hand[:3, :3])
-    x, y, z = spec.world_from_hand[:3, 3]
-    mount, parent = ['<link name="torchgrasp_world"/>'], "torchgrasp_world"
-    for slide in spec.slides:
-        child = f"{slide.name}_link"
-        mount.append(
-            f"""<link name="{child}"><inertial><origin xyz="0 0 0"/><mass value="1"/>
-    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
-  <joint name="{slide.name}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>
-    <axis xyz="{" ".join(f"{x:.12g}" for x in slide.axis)}"/>
-    <limit lower="{slide.lower:.9g}" upper="{slide.upper:.9g}" effort="1000" velocity="10"/></joint>"""
-        )
-        parent = child
-    mount.append(
-        f"""<joint name="{WRIST_JOINT}" type="fixed"><parent link="{parent}"/><child link={quoteattr(urdf.root)}/>
-    <origin xyz="{x:.12g} {y:.12g} {z:.12g}" rpy="{roll:.12g} {pitch:.12g} {yaw:.12g}"/></joint>"""
-    )
-    robot[:0] = list(ET.fromstring(f"<mount>{''.join(mount)}</mount>"))
+    angles = euler_from_rotation(spec.world_from_hand[:3, :3])
+    known = {"slides": spec.slides, "root": urdf.root, "place": spec.world_from_hand[:3, 3], "angles": angles}
+    path = Path(__file__).parent / "templates" / "mount.xml.jinja"
+    robot[:0] = list(ET.fromstring(render(path, **known, wrist=WRIST_JOINT)))
     return ET.tostring(robot, encoding="unicode")
 
 

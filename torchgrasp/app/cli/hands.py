@@ -17,7 +17,7 @@ from torchgrasp.base import count_status
 from torchgrasp.checks import Range, Seed
 from torchgrasp.data.shipped import load_object
 from torchgrasp.errors import BadArgument, GraspError, OutputError, Status
-from torchgrasp.files import format_columns, hold_file, temporary_folder, write_file
+from torchgrasp.files import format_columns, hold_file, render, temporary_folder, write_file
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand
@@ -191,29 +191,15 @@ def _try_objects(hand: Hand, bar: tqdm) -> bool:
 
 def describe(hand: Hand, joints: torch.Tensor) -> str:
     """Return a text about a hand: its joints, its fingers, and statistics of random postures (n, h) [rad]."""
-    tips = hand.tips
-    lines = [f"{hand.name}, option {hand.source.option}: {hand.dof} actuated of {len(hand.tree.joint_names)} joints"]
-    for name, low, high in zip(hand.joint_names, hand.lower.rad2deg(), hand.upper.rad2deg(), strict=True):
-        lines.append(f"  {name:24} {low:7.1f} to {high:6.1f} degrees")
-    for k, finger in enumerate(tips.names):
-        radius = float(tips.radius[k])
-        tip = f"a sphere of {1e3 * radius:.1f} mm" if radius else "a point"
-        contact, normal = (", ".join(f"{x:.4g}" for x in v[k].tolist()) for v in (tips.contact, tips.normal))
-        lines += [f"finger {finger}: {tip} on {tips.links[k]}", f"  contact [{contact}] m, normal [{normal}]"]
-    for name, row, offset in zip(hand.tree.joint_names, hand.actuated.coupling, hand.actuated.offset, strict=True):
-        source = int(row.abs().argmax())
-        if not row[source]:
-            lines.append(f"joint {name} is parked at {offset:.4g}")
-        elif hand.joint_names[source] != name:
-            lines.append(f"joint {name} = {row[source]:.4g} {hand.joint_names[source]} + {offset:.4g}")
     points, normals = hand.fingertips(joints)
     free = hand.self_clearance(joints) > 0
-    sides = 1e3 * torch.linalg.vector_norm(points - points.roll(1, 1), dim=-1)[free]
-    closing = can_close(points[free], normals[free]).double().mean()
-    lines.append(f"{1 - free.double().mean():.1%} of {len(joints)} random postures collide with themselves")
-    lines.append(f"{closing:.1%} of the free ones can hold an object between the middles of their pads (friction 0.8)")
-    lines.append(f"fingertips are {sides.quantile(0.01):.0f} to {sides.quantile(0.99):.0f} mm apart")
-    return "\n".join(lines)
+    found = {
+        "free": float(free.double().mean()),
+        "closing": float(can_close(points[free], normals[free]).double().mean()),
+        "sides": 1e3 * torch.linalg.vector_norm(points - points.roll(1, 1), dim=-1)[free],
+    }
+    path = Path(__file__).parent / "templates" / "hand.txt.jinja"
+    return render(path, hand=hand, count=len(joints), **found).rstrip("\n")
 
 
 @arguments(folder="out", path="out")
