@@ -1,8 +1,10 @@
 """Why an object was not held: the cause of a failed trial, from the trial's record and the true object."""
 
 import dataclasses
+import json
 import math
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -19,18 +21,7 @@ from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.lazy import trimesh
 from torchgrasp.specs import TrialSpec
 
-CAUSES = {
-    "start overlap": ("mm", "the opened hand overlapped the object or the table"),
-    "toppled": ("deg", "the object tilted by more than 30 degrees before the lift"),
-    "pushed away": ("mm", "the object moved by more than 20 mm before all fingers touched"),
-    "ejected": ("mm", "the object moved by more than 20 mm between the last touch and the lift"),
-    "shape off": ("mm", "a planned contact was more than 10 mm off the true surface"),
-    "never met": ("mm", "a finger never touched; its planned contact was so far off the surface"),
-    "too weak": ("N", "the drives were at their limits; the size is the largest normal force"),
-    "dropped when pushed": ("N", "the lifted object was lost under the push"),
-    "turned": ("deg", "the object turned in the closed hand by more than 30 degrees, before it slid"),
-    "slid": ("mm", "the object slid in the closed hand, or hung on one finger"),
-}
+CAUSES: dict[str, list[str]] = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
 """Causes by name: the unit of the size, and a sentence. The first that applies to a trial is its cause."""
 
 

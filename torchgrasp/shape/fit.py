@@ -239,11 +239,8 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
         _warn(Gap, f"{width}: a hole, or a patch that was not measured; the surface there is a guess")
     if on_table:
         points = cloud.points.double().cpu()
-        up, spacing = (
-            torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu"),
-            float(nearest(points, 2)[0][:, -1].median()),
-        )
-        body = find_second_body(points, up, spacing)
+        spacing = float(nearest(points, 2)[0][:, -1].median())
+        body = find_second_body(points, torch.tensor([0.0, 0.0, 1.0]).to(points), spacing)
         if body is not None:
             share = float(body.double().mean())
             _warn(TwoBodies, f"two bodies that stand apart, the second of {share:.0%} of the points: give one of them")

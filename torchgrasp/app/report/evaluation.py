@@ -1,11 +1,12 @@
 """The HTML page of an evaluation: success rates with intervals, and failures."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchgrasp.app.report.page import render
+from torchgrasp.app.report.page import TEMPLATES, render
 from torchgrasp.checks import checked
 from torchgrasp.errors import Status
 from torchgrasp.evaluation.causes import CAUSES
@@ -13,11 +14,8 @@ from torchgrasp.evaluation.intervals import Share, format_share
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.files import write_file
 
-SHARE_NAMES = {
-    "gsr": "grasps tried that pass",
-    "top1": "best-ranked grasps that pass, of all views",
-    "objects": "objects with a grasp that passes",
-}
+NAMES = json.loads((TEMPLATES / "evaluation.json").read_text("utf-8"))
+SHARE_NAMES: dict[str, str] = NAMES["shares"]
 """Descriptions of the success rates of a summary."""
 
 
@@ -108,21 +106,8 @@ def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return table rows with counts, mean forces, overlaps, slips and computing times."""
-    names = {
-        "refused": ("views without a grasp: a failure of the best grasp, not of the grasps tried", "d"),
-        "executable": ("executable grasps", "d"),
-        "tries": ("trials that passed with the first grasp, with the second grasp, ...", "d"),
-        "force_n": ("mean normal force of a finger [N]", ".2f"),
-        "overlap_mm": ("overlap of hand and object at the grasp, mean [mm]", ".1f"),
-        "overlap_mm_max": ("overlap of hand and object at the grasp, most [mm]", ".1f"),
-        "slip_mm": ("slip of held objects, median and 95 % quantile [mm]", ".1f"),
-        "slip_deg": ("turn of held objects, median and 95 % quantile [deg]", ".1f"),
-        "plan_cpu_s": ("CPU time to plan on a view [s]", ".1f"),
-        "trial_cpu_s": ("CPU time of a trial [s]", ".2f"),
-        "cpu_s": ("CPU time in all [s]", ".0f"),
-    }
     rows = []
-    for key, (text, style) in names.items():
+    for key, (text, style) in NAMES["figures"].items():
         found = summary[key] if isinstance(summary[key], tuple | list) else [summary[key]]
         rows.append((text, ", ".join("-" if x is None else format(x, style) for x in found)))
     return rows
