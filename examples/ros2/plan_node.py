@@ -8,6 +8,7 @@ import contextlib
 import functools
 import json
 import math
+import re
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -74,7 +75,8 @@ def plan(
     best = grasps[(grasps.status == Status.OK) & stays.all(2).all(1)][: goal.most or None]
     if not len(best):
         return Planned([], message="no executable grasp: torchgrasp cloud check and grasp tell more about the cloud")
-    file = Path(settings.folder or tempfile.mkdtemp(), f"{goal.object_id or 'object'}.safetensors")
+    name = re.sub(r"[^\w-]", "_", goal.object_id) or "object"  # no id leads out of the folder
+    file = Path(settings.folder or tempfile.mkdtemp(), f"{name}.safetensors")
     best.save(file)
     text = format_moveit(
         hand,
