@@ -22,11 +22,11 @@ from torchgrasp.app.author.repair import fix_wrist, keep_below, merge_frames, re
 from torchgrasp.base import FINGERTIPS
 from torchgrasp.checks import Seed, checked
 from torchgrasp.errors import BadArgument
+from torchgrasp.files import render
 from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.urdf import REPAIR, SIZES, Mimic, Triple, Urdf, read_published
-from torchgrasp.lazy import jinja2
 
 OPTIONS = {"default": 3, "four": 4, "five": 5}  # sets of fingers that a draft declares if the hand has as many
 
@@ -202,10 +202,8 @@ def _toml_text(
 
 def _render(template: str, **values: Any) -> str:
     """Return the text of a file from its template."""
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    engine = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
-    engine.filters |= {"toml": functools.partial(json.dumps, ensure_ascii=False), "xml": _quoted}
-    return engine.get_template(f"{template}.jinja").render(values)
+    filters = {"toml": functools.partial(json.dumps, ensure_ascii=False), "xml": _quoted}
+    return render(Path(__file__).with_name(f"{template}.jinja"), filters, **values)
 
 
 def _quoted(value: str | float | Sequence[float]) -> str:
