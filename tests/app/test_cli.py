@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 
+from tests.make import run_python
 from torchgrasp import GraspTask
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasps, inputs
@@ -171,6 +172,7 @@ def test_objects_lists_files_that_exist(capsys):
     lines = capsys.readouterr().out.splitlines()
     paths = [line.split(": ")[1] for line in lines if ": " in line]
     assert len(paths) == 8 and all(Path(p).read_bytes()[:3] == b"ply" for p in paths)
+    assert run_python("-m", "torchgrasp", "objects").stdout.splitlines() == lines
 
 
 def test_the_table_is_at_the_lowest_point_that_is_no_outlier_unless_it_is_given(tmp_path, monkeypatch):
