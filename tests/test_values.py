@@ -210,6 +210,9 @@ def test_values_differ_by_one_number_a_dtype_or_a_text_and_missing_numbers_are_e
     grasp = pinch("allegro")[1]
     assert grasp != dataclasses.replace(grasp, meta=grasp.meta | {"seed": "another"})
     assert len({grasp, grasp[[0]], grasp[[0, 0]]}) == 2
+    Odds = dataclasses.make_dataclass("Odds", [("share", float)], bases=(Value,), frozen=True)
+    unknown, other = Odds(float("nan")), Odds(float("nan"))
+    assert unknown == other != Odds(0.5) and hash(unknown) == hash(other)
 
 
 def test_a_hand_is_pickled_without_what_was_derived_from_it():

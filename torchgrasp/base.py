@@ -114,7 +114,7 @@ def _same(one: Any, other: Any) -> bool:
         return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
     if isinstance(one, tuple | list) and type(one) is type(other):
         return len(one) == len(other) and all(map(_same, one, other))
-    return one is other or bool(one == other)
+    return one is other or bool(one == other) or (_is_nan(one) and _is_nan(other))
 
 
 def _digest(value: Any) -> int:
@@ -124,7 +124,11 @@ def _digest(value: Any) -> int:
         return hash((value.shape, *flat[:: max(1, len(flat) // some)].nan_to_num().tolist()))
     if isinstance(value, dict):
         return hash(frozenset((key, _digest(x)) for key, x in value.items()))
-    return hash(tuple(map(_digest, value)) if isinstance(value, tuple | list) else value)
+    return hash(tuple(map(_digest, value)) if isinstance(value, tuple | list) else not _is_nan(value) and value)
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and value != value
 
 
 def _short(value: Any) -> str:

@@ -226,7 +226,7 @@ class Grasps(Batch):
     direction. `score` is the log-odds of the predicted success, which ranks the grasps; `interval` bounds the share of
     such grasps that held in trials (95 % over families). `known` tells for which grasps trials support the prediction;
     None means for all. `meta` holds names, units, hashes and the seed as text. With an arm, `arm` are its joints [rad],
-    and `ease` its least joint margin and manipulability on the way (`torchgrasp.arm.ArmPath`).
+    and `ease` its least joint margin and manipulability on the way (`torchgrasp.arm`).
 
     Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are its joints. For all
     joints of the hand see `Hand.expand`, for a 3D page `torchgrasp.app.report.show_grasps`.

@@ -114,3 +114,18 @@ def test_a_motion_has_all_joints_and_goes_through_the_grasp(arm, hand, good):
     assert torch.allclose(real(seconds), motion.times)
     with pytest.raises(BadArgument, match=r"grasps: .*posture of this arm"):
         plan_motion(arm, hand, dataclasses.replace(good[:1], arm=None))
+    for other in (ur5e(hand, (-0.45, 0.0, 0.0)), arm.moved(random_motion(2))):  # it stands elsewhere
+        with pytest.raises(BadArgument, match=r"grasps: .*posture of this arm"):
+            plan_motion(other, hand, good[:1])
+    again = plan_motion(arm.to(torch.float32), hand, good[:3].to(torch.float32))
+    assert torch.allclose(again.positions, motion.positions, atol=1e-3)
+
+
+def test_without_a_table_the_way_that_the_planner_judges_is_that_of_the_motion(hand):
+    """The least room of a joint in `ease` is that of the motion, which lifts along z and not towards the camera."""
+    arm = ur5e(hand, (-0.95, 0.0, 0.2))  # almost stretched
+    found = plan_grasps(load_object("cylinder").view, hand, starts=8, arm=arm)
+    found = found[found.status == Status.OK]
+    joints = plan_motion(arm, hand, found).positions[..., : len(arm.lower)]
+    room = torch.minimum(joints - arm.lower, arm.upper - joints) / ((arm.upper - arm.lower) / 2)
+    assert len(found) > 3 and torch.allclose(room.flatten(1).amin(1), found.ease[:, 0], atol=1e-4)

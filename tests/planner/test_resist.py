@@ -87,6 +87,8 @@ def test_wrenches_about_a_point_are_those_of_the_callers_frame():
     torch.testing.assert_close(rotate(FRAME, down[None])[0], real([0.0, 0.0, -9.81]))  # of the cloud, without a table
     with pytest.raises(BadArgument, match="wrenches"):
         TaskWrenches(torch.zeros(1, 6))
+    with pytest.raises(BadArgument, match=r"resist: .*no load"):
+        plan_grasps(VIEW, HAND, resist=())
 
 
 def test_many_clouds_resist_alone_as_together():

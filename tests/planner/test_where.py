@@ -54,3 +54,5 @@ def test_a_region_is_of_one_cloud():
     for name in ("keep", "avoid"):
         with pytest.raises(BadArgument, match=name):
             plan_grasps([VIEW, VIEW], HAND, **{name: Region.rim(VIEW, 0.0)})
+    with pytest.raises(BadArgument, match=r"spec: .*region"):
+        plan_grasps([VIEW, VIEW], HAND, ContactSpec(region=Region.rim(VIEW, 0.0)))

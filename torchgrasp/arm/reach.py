@@ -34,23 +34,23 @@ def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor,
     return reached.to(obj_from_hand.device)
 
 
-def with_arm(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld) -> Grasps:
+def with_arm(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"]) -> Grasps:
     """Return grasps with the postures of the arm; executable ones through which it has no way become `UNREACHABLE`."""
     rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
-    way, found, least = follow_grasps(arm, hand, grasps[rows], world)
+    way, found, least = follow_grasps(arm, hand, grasps[rows], world, up)
     status = grasps.status.index_put((rows[~found],), torch.tensor(int(Status.UNREACHABLE)).to(grasps.status))
     joints = way.new_zeros(len(grasps), way.shape[2]).index_copy(0, rows, way[:, COARSE_STEPS + 1])
     ease = least.new_zeros(len(grasps), 2).index_copy(0, rows, least)
     return dataclasses.replace(grasps, status=status, arm=joints, ease=ease)
 
 
-def follow_grasps(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld) -> Way:
+def follow_grasps(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP) -> Way:
     """Return the arm's way through each grasp, zeros if there is none.
 
     It goes through the easiest posture that reaches the grasp, and from which it can follow the whole way: without a
     jump, a joint beyond its limits, or a collision of its links with the world, each other or the palm.
     """
-    poses, starts, at = way_of(hand, grasps, world).to(arm.lower), 8, COARSE_STEPS + 1
+    poses, starts, at = way_of(hand, grasps, world, up).to(arm.lower), 8, COARSE_STEPS + 1
     (g, w), tips = poses.shape[:2], arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
     near = _nearest(arm, tips[..., at], starts).flatten()
     joints, solved = solve_tips(arm, arm.library[near].T, tips[..., at].repeat_interleave(starts, 2))
@@ -69,12 +69,15 @@ def follow_grasps(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld) -
     return way, found, least
 
 
-def way_of(hand: Hand, grasps: Grasps, world: CollisionWorld) -> Float[Tensor, "g w 4 4"]:
-    """Return the hand's poses on its way: in the first half it is opened, in the second half it has closed."""
+def way_of(hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP) -> Float[Tensor, "g w 4 4"]:
+    """Return the hand's poses on its way: in the first half it is opened, in the second half it has closed.
+
+    It is lifted along the normal of the table, or `up` without a table.
+    """
     closed, height = grasps.obj_from_hand, 0.1  # [m], of the lift
     opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
     share = torch.linspace(0, 1, COARSE_STEPS + 1, device="cpu").to(closed)[:, None]
-    up = (UP if world.plane is None else world.plane.normal).to(closed)
+    up = (up if world.plane is None else world.plane.normal).to(closed)
     before, after = (x[:, None].repeat(1, len(share), 1, 1) for x in (opened, closed))
     before[..., :3, 3] -= APPROACH_DISTANCE * (1 - share) * grasps.approach[:, None]
     after[..., :3, 3] += height * share * up

@@ -43,19 +43,19 @@ def plan_motion(arm: Arm, hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Po
     """Return the motions of arm and hand through executable grasps that were planned with the arm.
 
     The hand comes straight at 0.1 m/s from 0.1 m, and is lifted by 0.1 m as fast. `force` and `kp` are those of
-    `format_grasps`. The way to the first posture is not planned. Raises `BadArgument` for grasps without postures of an
-    arm, or with another number of joints, and the errors of `format_grasps`.
+    `format_grasps`. The way to the first posture is not planned. Without a table z points up. Raises `BadArgument`
+    for grasps without postures of this arm where it stands, and the errors of `format_grasps`.
 
     >>> motion = plan_motion(arm, hand, plan_grasps(cloud, hand, spec, arm=arm)[:1])  # doctest: +SKIP
     >>> motion.phases  # doctest: +SKIP
     {'above': 0, 'pregrasp': 8, 'grasp': 9, 'squeeze': 10, 'lift': 18}
     """
-    if grasps.arm is None or grasps.arm.shape[1] != len(arm.lower) or not bool(grasps.arm.any(1).all()):
+    arm, grasps = arm.to("cpu", torch.float64), grasps.to("cpu", torch.float64)
+    if grasps.arm is None or grasps.arm.shape[1] != len(arm.lower) or not _holds(arm, grasps.arm, grasps.obj_from_hand):
         raise BadArgument("grasps", "a grasp without a posture of this arm", "executable grasps of plan_grasps(arm=)")
-    grasps, near, step = grasps.to("cpu", torch.float64), COARSE_STEPS, 1.0 / COARSE_STEPS  # [s], at 0.1 m/s
+    near, step = COARSE_STEPS, 1.0 / COARSE_STEPS  # [s], at 0.1 m/s
     poses = way_of(hand.to("cpu", torch.float64), grasps, CollisionWorld(table=grasps.table))
     tips = arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
-    assert grasps.arm is not None
     way, _ = track(arm, grasps.arm.T.contiguous(), tips)
     postures = named_postures(hand, grasps, force, kp)[1]
     opened, closed, pressed = (torch.stack(list(joints.values()), -1)[:, None] for joints in postures.values())
@@ -67,3 +67,8 @@ def plan_motion(arm: Arm, hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Po
         torch.cat([torch.cat([way[:, : near + 2], way[:, near + 1 :]], 1), fingers], 2),
         {"above": 0, "pregrasp": near, "grasp": near + 1, "squeeze": near + 2, "lift": 2 * near + 2},
     )
+
+
+def _holds(arm: Arm, joints: Float[Tensor, "g n"], obj_from_hand: Float[Tensor, "g 4 4"]) -> bool:
+    """Return whether the arm holds the hand in the given poses, to a millimetre."""
+    return torch.allclose(arm.hand_poses(joints), obj_from_hand, rtol=0.0, atol=1e-3)

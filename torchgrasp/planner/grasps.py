@@ -65,6 +65,7 @@ def plan_grasps(
         reachable: function that returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4) an arm reaches, in
             the frame of the cloud; by default all poses are reachable.
         arm: the arm that carries the hand, from `load_arm`; it must reach each grasp by a straight approach, and lift.
+            Without a table z points up.
         keep, avoid: a `Region` in which all contacts lie, and one in which none lies; or a function of points (n, 3)
             [m] that returns their signed distance [m], negative inside. Contacts lie on the estimated surface.
         resist: what contacts must resist, see `Resist`: "lift", "pour", "push", several of them, or `TaskWrenches`.
@@ -81,9 +82,8 @@ def plan_grasps(
 
     Raises:
         BadArgument: an argument of the wrong type or range; a cloud of an object that is not of graspable size; a scene
-            without a target; `shape`, `observer`, `reachable`, `arm`, `keep` or `avoid` beside several
-            clouds.
-        MissingExtra: pebble is not installed, for workers.
+            without a target; `shape`, `observer`, `reachable`, `arm` or a region beside several clouds.
+        MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
 
     The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps clear of the target's
     neighbours and of space that is probably full. The remaining risk of collision lowers `Grasps.success`. Grasps are

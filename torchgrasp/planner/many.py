@@ -35,6 +35,8 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
     for name in ("shape", "observer", "reachable", "arm", "keep", "avoid"):
         if given.get(name) is not None:
             raise BadArgument(name, "one for many clouds", "None for many clouds")
+    if given["spec"] is not None and given["spec"].region is not None:
+        raise BadArgument("spec", "a region for many clouds", "one without a region for many clouds")
     requests = [Request(cloud, **given) for cloud in clouds]
     hands = [request.hands for request in requests]  # wrong fingers are refused
     devices = {cloud.points.device for cloud in clouds}

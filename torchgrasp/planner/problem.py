@@ -203,7 +203,7 @@ class Problem:
         if (arm := self.request.arm) is None:
             return grasps
         arm = settle(arm.moved(inverse(self.obj_from_upright)), self.shape.device)
-        return with_arm(arm, self.hand, grasps, self.world)
+        return with_arm(arm, self.hand, grasps, self.world, self.obj_from_upright[2, :3])  # the caller's z axis
 
     def tell(self, stage: str, message: str, value: Any) -> None:
         """Report a stage to the observer, with the result of the stage in the caller's frame."""

@@ -92,7 +92,9 @@ class Request:
     time_budget: Budget | None = None
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` for a promise about an object that may be elsewhere, which no trials support."""
+        """Raise `BadArgument` for no load, and for a promise about an object elsewhere, which no trials support."""
+        if isinstance(self.resist, tuple) and not self.resist:
+            raise BadArgument("resist", "no load", "at least one, or None")
         if self.promise is not None and self.grasp_task.displaced:
             raise BadArgument("promise", f"{self.promise:g} for a displaced object", "None")
 
