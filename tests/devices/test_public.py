@@ -4,12 +4,14 @@ from typing import Any
 
 import pytest
 import torch
+from benchmarks.ur5e import ur5e
 
 from tests.devices.conftest import same, sent
 from tests.devices.elsewhere import DEVICE
 from torchgrasp import (
     ContactSpec,
     PointCloud,
+    Region,
     certify,
     closing_gains,
     closure_probability,
@@ -154,6 +156,15 @@ def test_a_library_of_another_device_is_refused(device, hand, grasps):
 def test_a_given_shape_decides_where_grasps_are(device, hand, shape):
     assert plan_grasps(VIEW, hand, SPEC, 1, shape=sent(shape)).joints.device == DEVICE
     assert plan_grasps(sent(VIEW), hand, SPEC, 1, shape=shape).joints.device == CPU
+
+
+def test_what_is_asked_of_contacts_and_of_the_arm_is_judged_where_the_cloud_is(device, hand):
+    asked = {"resist": ("lift", "push"), "keep": Region.rim(VIEW, 0.0, 0.9), "arm": ur5e(hand)}
+    here, there = (plan_grasps(view, hand, SPEC, 2, **asked) for view in (VIEW, sent(VIEW)))
+    assert there.arm.device == there.certificate.task_margin.device == DEVICE
+    assert torch.equal(there.status.cpu(), here.status)
+    torch.testing.assert_close(there.arm.cpu(), here.arm)
+    torch.testing.assert_close(there.certificate.task_margin.cpu(), here.certificate.task_margin)
 
 
 def test_single_precision_goes_in_and_double_comes_out(device, hand):

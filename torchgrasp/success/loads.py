@@ -74,9 +74,8 @@ def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -
 def strength_of(hand: Hand, grasps: Grasps, most: float) -> Float[Tensor, "g f"]:
     """Return the greatest normal force [N] of each fingertip alone, by its drives, of at most `most` [N]."""
     normals = grasps.contacts.normals.to(grasps.joints)
-    alone = [
-        torch.zeros_like(normals).index_copy(1, k, -normals[:, k]) for k in torch.arange(normals.shape[1])[:, None]
-    ]
+    own = torch.eye(normals.shape[1], dtype=torch.bool, device=normals.device)[..., None]
+    alone = torch.where(own, -normals[:, None], 0.0).unbind(1)
     return torch.stack([greatest_force(hand, grasps, one) for one in alone], 1).nan_to_num(0.0).clamp(0.0, most)
 
 
