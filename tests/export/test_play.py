@@ -15,6 +15,7 @@ import pytest
 import torch
 import trimesh
 from benchmarks.close.play import PLAYERS, ROOT, play_all
+from scipy.spatial import ConvexHull
 
 from torchgrasp import load_hand, load_object
 from torchgrasp.app import cli
@@ -202,3 +203,38 @@ def test_the_command_plays_on_the_estimated_surface(tmp_path, capsys):
     assert cli.main(words) == 0 and str(out) in capsys.readouterr().out
     solid = trimesh.load(out / "object.ply")
     assert solid.is_watertight and solid.extents == pytest.approx(load_object("cylinder").mesh.extents, abs=0.02)
+    base = solid.vertices[solid.vertices[:, 2] < solid.bounds[0, 2] + 1e-6, :2]  # on a round base it would rock
+    assert ConvexHull(base).volume > 0.5 * ConvexHull(solid.vertices[:, :2]).volume
+
+
+def test_the_parts_of_another_object_in_the_folder_are_not_used(tmp_path):
+    for name in ("jug", "cylinder"):
+        folder, mesh = export(tmp_path, "maniskill", name, "barrett", 0.25), load_object(name).mesh
+        files = json.loads((folder / "play.json").read_text())["object"]["files"]
+        bounds = trimesh.util.concatenate([trimesh.load(folder / file) for file in files]).bounds
+        assert bounds / 100 == pytest.approx(mesh.bounds, abs=1e-3)
+    assert len(files) < len(list(folder.glob("*.obj"))) and "glob" not in (folder / "environment.py").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--format", "json", "--mass", "2"], "--mass: expected a format that it is for"),
+        (["--format", "glb", "--friction", "0.5"], "--friction: expected a format that it is for"),
+        (["--format", "json", "--rename", "spread=a", "spread=b"], "--rename: expected each joint once"),
+    ],
+)
+def test_no_option_of_an_export_is_ignored(words, told, tmp_path, capsys):
+    load_shipped_grasp("jug", "barrett").save(tmp_path / "grasps.safetensors")
+    (tmp_path / "surface.ply").write_bytes(load_object("jug").mesh.export(file_type="ply"))
+    out = tmp_path / "out"
+    assert cli.main(["export", str(tmp_path / "grasps.safetensors"), "--out", str(out), *words]) == 2
+    assert told in capsys.readouterr().err and not out.exists()
+
+
+def test_a_glb_counts_the_one_grasp_that_it_holds(tmp_path, capsys):
+    grasp, file = load_shipped_grasp("jug", "barrett"), tmp_path / "grasps.safetensors"
+    grasp[[0, 0]].save(file)
+    (tmp_path / "surface.ply").write_bytes(load_object("jug").mesh.export(file_type="ply"))
+    assert cli.main(["export", str(file), "--format", "glb", "--out", str(tmp_path / "jug.glb")]) == 0
+    assert capsys.readouterr().out.startswith("1 grasp of")

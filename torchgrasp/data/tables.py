@@ -8,8 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from torchgrasp.errors import MissingExtra, Status
-from torchgrasp.files import begin_folder, format_json, hold_folder, write_file
-from torchgrasp.lazy import jinja2
+from torchgrasp.files import begin_folder, format_json, hold_folder, render, write_file
 
 
 def import_arrow() -> Any:
@@ -45,9 +44,7 @@ def pack_table(table: Any) -> bytes:
 
 def render_card(template: str, **values: Any) -> str:
     """Return a text beside the tables, for people or programs, from its template."""
-    loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
-    engine = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
-    return engine.get_template(f"{template}.jinja").render(values, Status=Status)
+    return render(Path(__file__).parent / "templates" / f"{template}.jinja", Status=Status, **values)
 
 
 def write_folder(folder: Path | str, source: Mapping[str, Any], files: Iterable[tuple[str, str | bytes]]) -> Path:

@@ -85,11 +85,15 @@ def save_play(
     write_file(folder / "object.ply", _mesh_file(solid, "ply"))
     if player in ("mujoco", "newton"):
         write_file(folder / "scene.xml", scene_mjcf(scene))
-    elif player == "maniskill":
-        write_file(folder / "hand.urdf", mounted_urdf(scene))
-        for k, corners in enumerate(some for hull in scene.hulls[0] for some in split_hull(hull)):
-            write_file(folder / f"part_{k}.obj", _mesh_file(hull(100.0 * corners), "obj"))
     values = _describe(hand, grasps, world_from_obj, scene, spec) | (describe_bodies(scene) if player in USD else {})
+    if player == "maniskill":
+        write_file(folder / "hand.urdf", mounted_urdf(scene))
+        split = [some for corners in scene.hulls[0] for some in split_hull(corners)]
+        values["body"]["files"] = [
+            f"part_{k}.obj" for k in range(len(split))
+        ]  # others may lie there of an earlier call
+        for name, corners in zip(values["body"]["files"], split, strict=True):
+            write_file(folder / name, _mesh_file(hull(100.0 * corners), "obj"))
     filters = {"json": json.dumps, "vector": lambda numbers: f"({', '.join(repr(float(x)) for x in numbers)})"}
     for name in ("play.json", *USD.get(player, ())):
         write_file(folder / name, render(TEMPLATES / f"{name}.jinja", filters, **values))

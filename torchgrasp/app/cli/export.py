@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+import torch
 
 from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
@@ -21,6 +22,7 @@ from torchgrasp.errors import BadArgument, ModelFileError, Status
 from torchgrasp.export.foreign import Quaternion, read_poses
 from torchgrasp.files import read_json, write_file
 from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.lazy import trimesh
@@ -70,8 +72,8 @@ class Export(Command):
         "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the object's id; "
         "glb, play-..., usd: a mesh, or the plan's cloud for the estimated surface; by default surface.ply of GRASPS",
     )
-    mass: float = option(0.1, "play-..., usd: mass of the object [kg]")
-    friction: float = option(0.8, "play-..., usd: coefficient of friction")
+    mass: float | None = option(None, "play-..., usd: mass of the object [kg]; by default 0.1")
+    friction: float | None = option(None, "play-..., usd: coefficient of friction; by default 0.8")
     rename: tuple[str, ...] = option(
         (), "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file of such an object"
     )
@@ -91,8 +93,10 @@ class Export(Command):
             flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
         robot = {"rename": read_names(self.rename), "flange": flange, "object_id": None if named else self.object}
         robot = {name: x for name, x in robot.items() if x is not None}
-        taken = inspect.signature(TEXTS[self.format]).parameters if self.format in TEXTS else ()
-        if unused := [name for name in robot if name not in taken]:
+        trial = {name: x for name, x in (("mass", self.mass), ("friction", self.friction)) if x is not None}
+        texts = inspect.signature(TEXTS[self.format]).parameters if self.format in TEXTS else ()
+        taken = trial if plays else texts
+        if unused := [name for name in (*robot, *trial) if name not in taken]:
             raise BadArgument(unused[0], f"--format {self.format}", "a format that it is for")
         with naming(path="GRASPS"):
             planned = load_grasps(self.grasps)
@@ -100,15 +104,15 @@ class Export(Command):
         if planned.meta.get("hand_sha256") != hand.source.sha256:
             found = f"{hand.name}, whose files are not those that were planned with"
             raise BadArgument("--hand", found, "the same hand")
-        best = planned[planned.status == Status.OK][: self.most]
+        best = planned[planned.status == Status.OK][: 1 if self.format == "glb" else self.most]
         force, body = 4.0 if self.force is None else self.force, Path(self.object or shown)
         with naming(hand="--format"):
             if plays and len(best):
                 player: Any = self.format.removeprefix("play-")
-                spec = TrialSpec(friction=self.friction, mass=self.mass, force=self.force, kp=self.kp)
+                spec = TrialSpec(force=self.force, kp=self.kp, **trial)
                 mesh = self._body(planned, body)
-                if isinstance(mesh, Surface):
-                    mesh = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
+                if isinstance(mesh, Surface) or body == shown:
+                    mesh = stand(mesh.mesh() if isinstance(mesh, Surface) else mesh, planned.table)
                 formats.save_play(hand, best, self.out, player, mesh, spec)
             elif self.format == "dexgraspbench":
                 stiffness = {} if self.kp is None else {"kp": self.kp}
@@ -134,10 +138,21 @@ class Export(Command):
             return read_mesh(path)
 
 
+def stand(mesh: "trimesh.Trimesh", table: Plane | None) -> "trimesh.Trimesh":
+    """Return a mesh whose points below the table are moved up to it: the round base of an estimate would rock."""
+    if table is None:
+        return mesh
+    below = table.height(torch.from_numpy(np.array(mesh.vertices))).clamp(max=0)[:, None] * table.normal.double()
+    return trimesh.Trimesh(mesh.vertices - below.numpy(), mesh.faces, process=False)
+
+
 def read_names(words: Sequence[str]) -> dict[str, str] | None:
     """Return names of joints, given as texts URDF=ROBOT or as the path of a .json file with an object of them."""
     if len(words) != 1 or "=" in words[0]:
-        return {joint: name for joint, _, name in (word.partition("=") for word in words)} or None
+        pairs = [word.partition("=")[::2] for word in words]
+        if len(names := dict(pairs)) < len(pairs):
+            raise BadArgument("rename", " ".join(words), "each joint once")
+        return names or None
     file = read_json(Path(words[0]), functools.partial(ModelFileError, "rename"), "URDF=ROBOT, or a JSON file of names")
     return {joint: name.text() for joint, name in file.entries().items()}
 
