@@ -13,6 +13,7 @@ import torch
 from tests.campaign.cheap import campaign, contents, work_on
 from tests.data.others import ROOT, read_foreign
 from tests.make import load_hand
+from torchgrasp.app import cli
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.data import GraspShards, read_shards, write_parquet
 from torchgrasp.errors import BadArgument, MissingExtra, ModelFileError, OutputError, Status
@@ -134,3 +135,12 @@ def test_no_grasps_other_cards_and_no_pyarrow_are_told(
     with pytest.raises(MissingExtra, match=r"torchgrasp\[data\]"):
         write_parquet(shards, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_campaign_without_pyarrow_ends_before_its_trials(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    monkeypatch.setattr("torchgrasp.app.cli.evaluate.import_simulator", lambda _: None)
+    words = ["campaign", str(tmp_path), "--hand", "barrett", "--out", str(tmp_path / "out"), "--parquet", "p"]
+    assert cli.main(words) == 2 and "torchgrasp[data]" in capsys.readouterr().err and not (tmp_path / "out").exists()

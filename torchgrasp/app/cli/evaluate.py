@@ -13,6 +13,7 @@ from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
 from torchgrasp.checks import Count, Range, Seed
 from torchgrasp.data import JobRow, read_entries, write_parquet
+from torchgrasp.data.tables import import_arrow
 from torchgrasp.errors import BadArgument, DatasetError, Status
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
@@ -183,6 +184,8 @@ class Campaign(_Trials):
     def run(self) -> int:
         """Run the campaign and print its counts; return the exit code."""
         import_simulator(self.simulator)
+        if self.parquet is not None:
+            import_arrow()  # not after hours
         if self.fingers == "auto":
             raise BadArgument("--fingers", "auto", "one set of fingers for all records")
         hand, _ = load_fingers(self.hand, self.fingers)

@@ -93,7 +93,9 @@ class Export(Command):
             flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
         robot = {"rename": read_names(self.rename), "flange": flange, "object_id": None if named else self.object}
         robot = {name: x for name, x in robot.items() if x is not None}
-        trial = {name: x for name, x in (("mass", self.mass), ("friction", self.friction)) if x is not None}
+        trial: dict[str, Any] = {
+            name: x for name, x in (("mass", self.mass), ("friction", self.friction)) if x is not None
+        }
         texts = inspect.signature(TEXTS[self.format]).parameters if self.format in TEXTS else ()
         taken = trial if plays else texts
         if unused := [name for name in (*robot, *trial) if name not in taken]:
@@ -149,7 +151,7 @@ def stand(mesh: "trimesh.Trimesh", table: Plane | None) -> "trimesh.Trimesh":
 def read_names(words: Sequence[str]) -> dict[str, str] | None:
     """Return names of joints, given as texts URDF=ROBOT or as the path of a .json file with an object of them."""
     if len(words) != 1 or "=" in words[0]:
-        pairs = [word.partition("=")[::2] for word in words]
+        pairs = [(joint, name) for joint, _, name in (word.partition("=") for word in words)]
         if len(names := dict(pairs)) < len(pairs):
             raise BadArgument("rename", " ".join(words), "each joint once")
         return names or None
