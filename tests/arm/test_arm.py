@@ -72,6 +72,10 @@ def test_files_that_are_no_arm_are_refused(hand, tmp_path):
         load(good, "hand")
     with pytest.raises(HandFileError, match="elbow_link with a mesh"):
         load(re.sub(r"(elbow_link.*?)<cylinder[^>]*>", r'\1<mesh filename="elbow.stl"/>', good, count=1))
+    mimic = r'\1<mimic joint="elbow_joint"/></joint>'
+    follower = re.sub(r'(joint name="wrist_1_joint".*?)</joint>', mimic, good, count=1, flags=re.DOTALL)
+    with pytest.raises(HandFileError, match="wrist_1_joint that follows another"):
+        load(follower)
     with pytest.raises(HandFileError, match="urdf"):
         load("<robot")
 

@@ -116,8 +116,8 @@ def load_arm(
         tip_from_hand: pose of the hand's root link in the frame of the tip; by default the same frame.
         seed: random seed of the postures from which inverse kinematics starts.
 
-    Raises `HandFileError` for a URDF that is missing or malformed, or has meshes on the way to the tip, and
-    `BadArgument` for a tip that is unknown, or that fewer than six joints move.
+    Raises `HandFileError` for a URDF that is missing or malformed, or has meshes or joints without a drive on the way
+    to the tip, and `BadArgument` for a tip that is unknown, or that fewer than six joints move.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")
@@ -132,6 +132,8 @@ def load_arm(
     if tip not in named or len(whole.movers(tip)) < 6:
         raise BadArgument("tip", repr(tip), "a link that at least six joints move")
     turn = 2 * math.pi
+    if followers := [joint.name for joint in whole.joints_above(tip) if joint.mimic]:
+        raise whole.wrong(f"joint {followers[0]} that follows another", "joints that each have a drive, up to the tip")
     way = [dataclasses.replace(j, lower=max(j.lower, -turn), upper=min(j.upper, turn)) for j in whole.joints_above(tip)]
     chain = dataclasses.replace(
         whole, links=(named[whole.root], *(named[j.child] for j in reversed(way))), joints=tuple(reversed(way))
