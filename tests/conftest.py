@@ -22,6 +22,8 @@ sys.dont_write_bytecode = False
 
 annotations.install()
 
+collect_ignore = ["export/play_usd.py"]  # its packages are in an environment beside; test_play.py runs it there
+
 SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 settings.register_profile("short", max_examples=100, derandomize=True, deadline=None, suppress_health_check=SLOW)
 settings.register_profile("long", max_examples=100_000, deadline=None, database=None, suppress_health_check=SLOW)

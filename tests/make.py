@@ -270,7 +270,7 @@ def closure_margin(points: Tensor, normals: Tensor, friction: float, edges: int 
 
 def run_python(*arguments: str, given: str = "") -> subprocess.CompletedProcess[str]:
     """Run Python in a process of its own that can import the library and the helpers of the tests, `given` a text."""
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    path = os.pathsep.join(filter(None, [str(ROOT), str(ROOT / "scripts"), os.environ.get("PYTHONPATH")]))
     environment = os.environ | {"PYTHONPATH": path}
     command = [sys.executable, *arguments]
     return subprocess.run(command, input=given, capture_output=True, text=True, timeout=600, env=environment)

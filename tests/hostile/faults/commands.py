@@ -43,7 +43,6 @@ def sample(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
 def train(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     """A mixture of one Gaussian, with a checkpoint after every step."""
     monkeypatch.setattr(hand_commands, "check_hand", load_hand)
-    monkeypatch.setattr(hand_commands, "STARTS", 1)
     words = ["hand", "train", "barrett", "--n", "100", "--held-out", "20", "--components", "1"]
     return lambda out: [
         *words,
