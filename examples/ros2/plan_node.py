@@ -59,6 +59,8 @@ def plan(
     """
     frame = goal.gravity_frame or goal.cloud.header.frame_id
     try:
+        rename = json.loads(Path(settings.names).read_text()) if settings.names else None
+        flange = torch.from_numpy(messages.read_pose(settings.flange[:3], settings.flange[3:]))
         hand = load(goal.hand or "allegro")
         cloud = messages.read_cloud(goal.cloud, frame_from_cloud, camera)
         table = None if math.isnan(goal.table) else goal.table
@@ -69,7 +71,7 @@ def plan(
         tell("cloud", f"{len(cloud)} points")
         observer = lambda stage, message, _: tell(stage, message)  # noqa: E731
         grasps = plan_grasps(cloud, hand, ContactSpec(table=table), settings.starts, observer=observer)
-    except (GraspError, ValueError) as error:
+    except (GraspError, OSError, ValueError) as error:
         return Planned([], message=str(error))
     stays = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table) == grasps.obj_from_hand
     best = grasps[(grasps.status == Status.OK) & stays.all(2).all(1)][: goal.most or None]
@@ -78,13 +80,7 @@ def plan(
     name = re.sub(r"[^\w-]", "_", goal.object_id) or "object"  # no id leads out of the folder
     file = Path(settings.folder or tempfile.mkdtemp(), f"{name}.safetensors")
     best.save(file)
-    text = format_moveit(
-        hand,
-        best,
-        rename=json.loads(Path(settings.names).read_text()) if settings.names else None,
-        flange=torch.from_numpy(messages.read_pose(settings.flange[:3], settings.flange[3:])),
-        object_id=goal.object_id or "object",
-    )
+    text = format_moveit(hand, best, rename=rename, flange=flange, object_id=goal.object_id or "object")
     return Planned(messages.write_grasps(types, text, frame, goal.cloud.header.stamp), str(file))
 
 

@@ -121,6 +121,13 @@ def test_a_goal_without_grasps_says_why(wrong, words):
     )
 
 
+def test_parameters_that_cannot_be_read_are_told_before_planning(tmp_path):
+    for wrong in ({"names": str(tmp_path / "none.json")}, {"flange": (0.0,) * 7}):
+        settings = plan_node.Settings(starts=5)._replace(**wrong)
+        found = plan_node.plan(bags.types(), goal(), CAMERA.numpy(), None, settings, lambda *_: pytest.fail("planned"))
+        assert found.grasps == [] and found.message
+
+
 def test_the_object_at_a_place_is_cut_out_of_a_scene():
     """Nothing is within half a metre of a place 2 m off; at the cylinder there is the cylinder, without its table."""
     told = []
