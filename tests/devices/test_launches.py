@@ -35,7 +35,7 @@ KNOWN = {
     "ik/motion.py": "_clearance find_approach",
     "ik/seeds.py": "_drawn nearest_postures",
     "plan/certify.py": "_prove check_unit forward",
-    "plan/closure.py": "_closed_in_plane _solve rank_ratio",
+    "plan/closure.py": "_closed_in_plane maximise rank_ratio",
     "plan/feasibility.py": "check_feasibility normal_variation",
     "plan/problem.py": "of",
     "plan/solve.py": "plan_chunk",

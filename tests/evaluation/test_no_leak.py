@@ -17,11 +17,13 @@ from tests.make import real
 from tests.pinch import cylinder, pinch
 from torchgrasp import ContactSpec, Plane, TrialSpec, load_object, plan_grasps
 from torchgrasp.control import ClosingReference, GraspController, Observation
+from torchgrasp.data.accept import as_cloud
 from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation import EvaluationSpec, GraspTrial, Truth
 from torchgrasp.evaluation.trial import TrialDriver, derive_reference
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import read_plane
+from torchgrasp.marks import Taken
 from torchgrasp.sim import Neighbour
 from torchgrasp.sim.scene import Scene
 from torchgrasp.sim.scene_spec import Body, SceneSpec
@@ -105,6 +107,10 @@ def mentioned(hint):
     seen, left = set(), [hint]
     while left:
         here = left.pop()
+        rules = [rule for rule in getattr(here, "__metadata__", ()) if isinstance(rule, Taken)]
+        if rules:  # the border makes a value of this kind of whatever is given
+            left += [rule.kind for rule in rules]
+            continue
         left += [x for x in typing.get_args(here) if not isinstance(x, str)]
         if inspect.isclass(here) and here not in seen:
             seen.add(here)
@@ -125,7 +131,7 @@ def hints_of(thing):
             if isinstance(node, ast.ImportFrom):
                 source = __import__(str(node.module), fromlist=["_"])
                 scope |= {x.asname or x.name: getattr(source, x.name) for x in node.names if hasattr(source, x.name)}
-    return typing.get_type_hints(inspect.unwrap(getattr(thing, "__func__", thing)), scope)
+    return typing.get_type_hints(inspect.unwrap(getattr(thing, "__func__", thing)), scope, include_extras=True)
 
 
 TAKERS = (
@@ -143,6 +149,12 @@ def test_what_plans_and_controls_takes_no_type_that_holds_the_truth(taker):
 @pytest.mark.parametrize("value", [ClosingReference, Observation, PointCloud, ContactSpec])
 def test_no_input_of_planner_or_controller_has_a_field_that_holds_the_truth(value):
     assert not mentioned(value) & set(SECRETS)
+
+
+def test_of_an_object_with_its_mesh_the_border_takes_the_view_alone():
+    thing = load_object("cylinder")
+    other = dataclasses.replace(thing, mesh=trimesh.creation.box([0.1, 0.1, 0.1]))
+    assert as_cloud(thing, "cloud") is thing.view and as_cloud(other, "cloud") is thing.view
 
 
 def test_the_search_for_types_finds_them():
