@@ -8,10 +8,10 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.columns import read_lines
 from torchgrasp.cloud.pcd import decompress
 from torchgrasp.cloud.read import cloud_from_array, read_cloud, read_cloud_file, save_cloud
 from torchgrasp.errors import BadArgument, CloudFileError, GraspError, OutputError, SuspiciousScale, TooFewPoints
+from torchgrasp.files.columns import read_lines
 from torchgrasp.values import PointCloud
 
 
@@ -237,7 +237,7 @@ def test_units_scale_points_and_the_viewpoint_of_the_file_alone(tmp_path, points
 
 
 def test_a_text_of_empty_lines_or_of_many_columns_is_refused_without_reading_it_all(monkeypatch):
-    monkeypatch.setattr("torchgrasp.cloud.columns.CLOUD_POINTS", 500)
+    monkeypatch.setattr("torchgrasp.files.columns.CLOUD_POINTS", 500)
     with pytest.raises(ValueError, match="more than 1000 lines"):
         read_lines(b"\n" * 1001 + b"1 2 3\n")
     with pytest.raises(ValueError, match="more than 16 numbers in a line"):

@@ -116,8 +116,8 @@ def load_arm(
         tip_from_hand: pose of the hand's root link in the frame of the tip; by default the same frame.
         seed: random seed of the postures from which inverse kinematics starts.
 
-    Raises `HandFileError` for a URDF that is missing or malformed, or has meshes or joints without a drive on the way
-    to the tip, and `BadArgument` for a tip that is unknown, or that fewer than six joints move.
+    Raises `HandFileError` for a URDF that is missing or malformed. On the way to the tip it may have no mesh, which
+    `clean_arm` replaces, and no joint without a drive. Raises `BadArgument` for a tip that fewer than six joints move.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")

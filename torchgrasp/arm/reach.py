@@ -152,7 +152,8 @@ def solve_tips(
         rows, motion, gap, error = rows[left], motion[..., left], gap[:, left], error[left]
         normal = (motion[:, :, None] * motion[:, None]).sum(0)
         normal.diagonal().T.add_(error / 2 + 1)
-        turned = joints[:, rows] + _eliminate(normal, (motion * gap[:, None]).sum(0))
+        step, _ = torch.linalg.solve_ex(normal.permute(2, 0, 1), (motion * gap[:, None]).sum(0).T)
+        turned = joints[:, rows] + step.T
         joints[:, rows] = turned.clamp(lower, upper)
     return joints, done
 
@@ -163,13 +164,3 @@ def _gap(tip: Float[Tensor, "3 4 k"], target: Float[Tensor, "3 4 k"]) -> Float[T
     sine, cosine = torch.linalg.vector_norm(axis, dim=0), ((tip[:, :3] * target[:, :3]).sum((0, 1)) - 1) / 2
     turn = axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))
     return torch.cat([(target[:, 3] - tip[:, 3]) / MILLIMETRE, LEVER * turn])
-
-
-def _eliminate(matrix: Float[Tensor, "n n k"], right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """Return the solutions of k positive definite systems, all at once."""
-    rows = torch.cat([matrix, right[:, None]], 1)
-    for i in range(len(rows)):
-        pivot = rows[i] / rows[i, i]
-        rows = rows - rows[:, i, None] * pivot
-        rows[i] = pivot
-    return rows[:, -1]

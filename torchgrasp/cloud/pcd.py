@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.cloud.columns import find_columns, read_fields
 from torchgrasp.files import Malformed
+from torchgrasp.files.columns import find_columns, read_fields
 from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 
 

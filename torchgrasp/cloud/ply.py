@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.cloud.columns import find_columns, read_fields
 from torchgrasp.files import Malformed, explain
+from torchgrasp.files.columns import find_columns, read_fields
 from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.lazy import trimesh
 from torchgrasp.limits import CLOUD_POINTS, TEXT_MESH_BYTES

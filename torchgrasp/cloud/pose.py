@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.checks import RIGID, check_tensor, is_rigid
-from torchgrasp.cloud.columns import read_lines
 from torchgrasp.cloud.tables import parse_npy, read_suffixed
 from torchgrasp.errors import BadArgument, NoSupport
 from torchgrasp.files import explain
+from torchgrasp.files.columns import read_lines
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support import Support, find_table

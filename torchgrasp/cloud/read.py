@@ -14,7 +14,6 @@ from torch import Tensor
 from torchgrasp.base import Value, named_tensors
 from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
-from torchgrasp.cloud.columns import find_columns, parse_text
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
@@ -22,6 +21,7 @@ from torchgrasp.cloud.tables import parse_npy, parse_npz
 from torchgrasp.cloud.viewpoint import can_see
 from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.files import explain, read_bounded, write_file
+from torchgrasp.files.columns import find_columns, parse_text
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
 from torchgrasp.values import PointCloud

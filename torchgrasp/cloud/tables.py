@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.cloud.columns import read_lines
 from torchgrasp.errors import BadArgument
 from torchgrasp.files import Malformed, check_file, explain, read_bytes
+from torchgrasp.files.columns import read_lines
 from torchgrasp.lazy import Image
 from torchgrasp.limits import CLOUD_BYTES, JSON_BYTES, TOML_BYTES
 

@@ -64,19 +64,24 @@ def carrying_force(
 
 def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Float[Tensor, "g"]:
     """Return the factor on balanced contact forces at which the first drive gives its greatest torque; NaN for NaN."""
-    joints = grasps.joints
-    hand_from_obj = inverse(grasps.obj_from_hand.to(joints))
-    jacobian = hand.jacobian(joints, apply(hand_from_obj, grasps.contacts.points.to(joints)))
-    torque = torch.einsum("gfih,gfi->gh", jacobian, rotate(hand_from_obj, forces.to(joints)))
-    return (torque.new_tensor([hand.actuators[name].effort for name in hand.joint_names]) / torque.abs()).amin(1)
+    jacobian, pushes, effort = _levers(hand, grasps, forces)
+    return (effort / torch.einsum("gfih,gfi->gh", jacobian, pushes).abs()).amin(1)
 
 
 def strength_of(hand: Hand, grasps: Grasps, most: float) -> Float[Tensor, "g f"]:
     """Return the greatest normal force [N] of each fingertip alone, by its drives, of at most `most` [N]."""
-    normals = grasps.contacts.normals.to(grasps.joints)
-    own = torch.eye(normals.shape[1], dtype=torch.bool, device=normals.device)[..., None]
-    alone = torch.where(own, -normals[:, None], 0.0).unbind(1)
-    return torch.stack([greatest_force(hand, grasps, one) for one in alone], 1).nan_to_num(0.0).clamp(0.0, most)
+    jacobian, pushes, effort = _levers(hand, grasps, -grasps.contacts.normals)
+    alone = (effort / torch.einsum("gfih,gfi->gfh", jacobian, pushes).abs()).amin(2)
+    return alone.nan_to_num(0.0).clamp(0.0, most)  # a contact that is unknown has no strength
+
+
+def _levers(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the Jacobians (g, f, 3, h) of the contacts, forces in the hand's frame, and the drives' efforts (h,)."""
+    joints = grasps.joints
+    hand_from_obj = inverse(grasps.obj_from_hand.to(joints))
+    jacobian = hand.jacobian(joints, apply(hand_from_obj, grasps.contacts.points.to(joints)))
+    effort = joints.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
+    return jacobian, rotate(hand_from_obj, forces.to(joints)), effort
 
 
 def log_odds_about(

@@ -18,14 +18,14 @@ import tyro
 from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
-from torchgrasp.app.cli import clouds, depth, doctor, evaluate, export, grasps, hands
+from torchgrasp.app.cli import clouds, depth, doctor, evaluate, export, grasps, hands, look
 from torchgrasp.app.cli.command import Command, execute
 from torchgrasp.errors import BadArgument, GraspError
 
 __all__ = ["main", "run_and_exit"]
 
 CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
-    "Plan grasps": {"grasp": grasps.Grasp, "view": grasps.View, "objects": grasps.Objects},
+    "Plan grasps": {"grasp": grasps.Grasp, "view": look.View, "objects": look.Objects},
     "Exchange grasps with other programs": {"export": export.Export, "import": export.Import},
     "Try many grasps in simulation": {"evaluate": evaluate.Evaluate, "campaign": evaluate.Campaign},
     "Point clouds and shapes": {

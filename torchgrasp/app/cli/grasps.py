@@ -1,8 +1,7 @@
-"""The commands `torchgrasp grasp`, which plans grasps of an object in a cloud or a scene, `objects` and `view`."""
+"""The command `torchgrasp grasp`, which plans grasps of an object in a cloud or a scene."""
 
 import dataclasses
 import functools
-import webbrowser
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +14,7 @@ from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.checks import Count, Seed
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
-from torchgrasp.data.shipped import DATA, MASSES, list_objects, load_object
+from torchgrasp.data.shipped import DATA, list_objects, load_object
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.export import save_surface
@@ -277,42 +276,6 @@ def print_grasps(run: Run) -> bool:
         print(f"lowers success  {sentence}")
     print(verdict(run))
     return len(run.executable) > 0
-
-
-@arguments()
-class View(Command):
-    """Open the 3D page of a folder that `torchgrasp grasp` wrote, view.html, in the browser."""
-
-    folder: Path = positional(
-        "folder that `torchgrasp grasp` wrote, a 3D page, or the name of a folder in out/, as jug"
-    )
-    no_browser: bool = option(False, "only print the address")
-
-    def run(self) -> int:
-        """Print the address of the 3D page and open it in the browser; return the exit code."""
-        folder = self.folder if self.folder.exists() else "out" / self.folder
-        page = folder if folder.suffix == ".html" else (folder if folder.is_dir() else folder.parent) / VIEW
-        if not page.is_file():
-            wanted = (
-                f"a folder that `torchgrasp grasp` wrote with a report: `torchgrasp grasp CLOUD --out {self.folder}`"
-            )
-            raise BadArgument("FOLDER", f"{self.folder} without {VIEW}", wanted)
-        print(page.resolve().as_uri())
-        if not self.no_browser and not webbrowser.open(page.resolve().as_uri()):
-            print("No browser was found here: open this address on another machine, or copy the file, which is whole.")
-        return 0
-
-
-@arguments()
-class Objects(Command):
-    """List the shipped objects, each with a noisy view and a true mesh."""
-
-    def run(self) -> int:
-        """Print name, mass and files of each shipped object; return the exit code."""
-        for name in list_objects():
-            folder = DATA / name
-            print(f"{name} ({MASSES[name]:g} kg)\n  view: {folder / 'view.ply'}\n  mesh: {folder / 'mesh.ply'}")
-        return 0
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":

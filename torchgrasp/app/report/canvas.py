@@ -232,6 +232,12 @@ def map_colors(values: Float[np.ndarray, " n"], name: str) -> Points:
     return matplotlib.colormaps[name](values)[:, :3]
 
 
+def color_std(std_m: Float[np.ndarray, " n"]) -> tuple[Points, float]:
+    """Return the colours of standard deviations [m], and the one that has the last colour: all but a hundredth."""
+    most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6
+    return map_colors(std_m / most, "viridis"), most
+
+
 def draw_bar(image: Any, title: str, most: float, colors: str) -> None:
     """Draw a titled colour bar from 0 to `most` at the bottom of a picture."""
     width, height = image.size

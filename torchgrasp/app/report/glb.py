@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.app.report.canvas import OBJECT, map_colors, rgb
+from torchgrasp.app.report.canvas import OBJECT, color_std, rgb
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import to_array
 from torchgrasp.checks import checked
@@ -54,8 +54,7 @@ def _solid(body: "Surface | trimesh.Trimesh") -> "trimesh.Trimesh":
     """Return the object as a mesh: in one colour, or an estimated surface by its standard deviation."""
     if not isinstance(body, Surface):
         return trimesh.Trimesh(body.vertices, body.faces, visual=_paint(OBJECT), process=False)
-    std_m, normals = to_array(body.std_m), to_array(body.normals)
-    colors = np.uint8(255 * _linear(map_colors(std_m / max(float(np.quantile(std_m, 0.99)), 1e-6), "viridis")))
+    normals, colors = to_array(body.normals), np.uint8(255 * _linear(color_std(to_array(body.std_m))[0]))
     points, faces = to_array(body.vertices), body.faces.cpu().numpy()
     return trimesh.Trimesh(points, faces, vertex_normals=normals, vertex_colors=colors, process=False)
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.app.report.canvas import FINGERS, OBJECT, map_colors, rgb
+from torchgrasp.app.report.canvas import FINGERS, OBJECT, color_std, rgb
 from torchgrasp.app.report.run import Run, moments_of
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import to_array
@@ -74,8 +74,7 @@ class _Recorder:
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._log(ROOT, rr.Transform3D(translation=to_array(frame[:3, 3]), quaternion=_quaternions(frame)))
         self._log(f"{ROOT}/cloud", rr.Points3D(to_array(run.cloud.points), colors=_bytes("#c2452d")))
-        std_m = to_array(run.surface.std_m)
-        shades = np.uint8(255 * map_colors(std_m / max(float(np.quantile(std_m, 0.99)), 1e-6), "viridis"))
+        shades = np.uint8(255 * color_std(to_array(run.surface.std_m))[0])
         solid = to_array(run.surface.vertices), run.surface.faces.cpu().numpy(), to_array(run.surface.normals)
         self._log(f"{ROOT}/surface", self._mesh(*solid, vertex_colors=shades))
         if not len(run.executable):

@@ -30,13 +30,12 @@ def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
 
 def draw_surface(surface: Surface, direction: Direction, table: float | None = None) -> bytes:
     """Return a PNG of the estimated surface seen from `direction`, coloured by its standard deviation [mm]."""
-    vertices, std_mm = to_array(surface.vertices), 1e3 * to_array(surface.std_m)
-    most = max(float(np.quantile(std_mm, 0.99)), 1e-3)
+    vertices, faces = to_array(surface.vertices), surface.faces.cpu().numpy()
+    colors, most = paint.color_std(to_array(surface.std_m))
     canvas = paint.Canvas()
-    faces, colors = surface.faces.cpu().numpy(), paint.map_colors(std_mm / most, "viridis")
     canvas.add_mesh(vertices, faces, colors, to_array(surface.normals))
     canvas.add_table(vertices, table)
-    return canvas.render_png(vertices, direction, bar=("standard deviation of the surface [mm]", most, "viridis"))
+    return canvas.render_png(vertices, direction, bar=("standard deviation of the surface [mm]", 1e3 * most, "viridis"))
 
 
 def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:

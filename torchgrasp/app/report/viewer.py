@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, map_colors
+from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, color_std, map_colors
 from torchgrasp.app.report.film import describe_film
 from torchgrasp.app.report.page import grasp_columns, grasp_rows, render
 from torchgrasp.app.report.run import Run, moments_of, verdict
@@ -160,13 +160,13 @@ def _surface(run: Run) -> dict[str, object]:
     """Return the estimated surface with standard deviations and colours, as a dict of arrays made by `pack`."""
     surface, std_m = run.surface, to_array(run.surface.std_m)
     kept, faces = thin_mesh(to_array(surface.vertices), surface.faces.cpu().numpy(), MOST_FACES)
-    most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6
+    colors, most = color_std(std_m)
     return {
         "points": pack(to_array(surface.vertices)[kept]),
         "normals": pack(to_array(surface.normals)[kept]),
         "faces": pack(faces, "u4"),
         "std": pack(std_m[kept]),
-        "colors": pack(np.round(255 * map_colors(std_m[kept] / most, "viridis")), "u1"),
+        "colors": pack(np.round(255 * colors[kept]), "u1"),
         "most_mm": 1e3 * most,
         "ramp": np.round(255 * map_colors(np.linspace(0.0, 1.0, 17), "viridis")).astype(int).tolist(),
     }

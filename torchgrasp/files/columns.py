@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from torchgrasp.files import Malformed
+from torchgrasp.files.write import Malformed
 from torchgrasp.limits import CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMNS
 
 
