@@ -10,10 +10,9 @@ from torchgrasp.evaluation.run import evaluate
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore, summarise
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.evaluation.views import EvaluationSpec
-from torchgrasp.evaluation.warp_pulls import pull_grasps
 
 __all__ = [
     "PROTOCOLS", "ClosingTrace", "Disturbance", "EvaluationSpec", "GraspTrial", "LiftTry", "ObjectMotion", "PoseNoise",
     "Protocol", "ProtocolResult", "PullResult", "PullSpec", "Share", "Truth", "ViewScore", "close_hand",
-    "evaluate", "find_protocol", "lift_grasps", "pull_grasp", "pull_grasps", "summarise",
+    "evaluate", "find_protocol", "lift_grasps", "pull_grasp", "summarise",
 ]  # fmt: skip

@@ -9,12 +9,12 @@ import torch
 from golden import OBJECTS, see
 
 from benchmarks.common import Options, Row, bench
+from benchmarks.gpu.warp_pulls import pull_drivers
 from torchgrasp import ContactSpec, Status, load_hand, load_object, plan_grasps
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullResult, Truth, pull_grasp
 from torchgrasp.evaluation.protocols import POSE_NOISE, draw_hand_errors, seed_of
 from torchgrasp.evaluation.pull import DIRECTIONS, INTERVAL
 from torchgrasp.evaluation.trial import TrialDriver
-from torchgrasp.evaluation.warp_pulls import pull_drivers
 from torchgrasp.jobs import run_tasks
 
 CASES = {

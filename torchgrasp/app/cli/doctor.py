@@ -36,7 +36,7 @@ class Doctor(Command):
     """List installed and missing packages, with the command that installs each.
 
     The exit code is 1 if a simulator or a package is missing, even though planning needs no simulator. A missing Dask,
-    which only `campaign --scheduler` needs, or MuJoCo Warp does not change the exit code.
+    which only `campaign --scheduler` needs, does not change the exit code.
     """
 
     def run(self) -> int:
@@ -56,6 +56,7 @@ def find_parts() -> list[Finding]:
     gpu = "none visible to torch; everything runs on the processor"  # no fault
     if torch.cuda.is_available():
         gpu = f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"
+    dask = _package("distributed", "pip install 'torchgrasp[cluster]'")
     return [
         Finding("torchgrasp", f"{__version__}, hands: {hands}"),
         Finding("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"),
@@ -64,8 +65,7 @@ def find_parts() -> list[Finding]:
         Finding("GPU", gpu),
         *(_simulator(name) for name in SIMULATORS),
         *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
-        _optional("distributed", "`torchgrasp campaign --scheduler`", "cluster"),
-        _optional("mujoco-warp", "`pull_grasps`", "warp"),
+        dask if not dask.fix else Finding(dask.part, f"none; `torchgrasp campaign --scheduler` needs it: {dask.fix}"),
     ]
 
 
@@ -109,12 +109,6 @@ def _package(name: str, fix: str = "pip install torchgrasp") -> Finding:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
         return Finding(name, "missing", fix)
-
-
-def _optional(name: str, user: str, extra: str) -> Finding:
-    """Return the version of a package that only one function uses; a missing one is not a fault."""
-    found = _package(name)
-    return Finding(name, f"none; {user} needs it: pip install 'torchgrasp[{extra}]'") if found.fix else found
 
 
 def _simulator(name: Simulator) -> Finding:

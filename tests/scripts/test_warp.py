@@ -7,10 +7,11 @@ import sys
 import pytest
 import torch
 import trimesh
+from benchmarks.gpu.warp_pulls import pull_grasps
 
 from tests.pinch import HEIGHT, cylinder, pinch
 from torchgrasp.errors import BadArgument, MissingExtra, Status
-from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, pull_grasp, pull_grasps
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, pull_grasp
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 PROTOCOL = dataclasses.replace(

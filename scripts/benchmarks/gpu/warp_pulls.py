@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 
+from benchmarks.gpu.warp_scene import WarpScenes
 from torchgrasp.checks import checked
 from torchgrasp.control.paper.closings import OpenLoopClosing
 from torchgrasp.errors import BadArgument, Status
@@ -13,7 +14,6 @@ from torchgrasp.evaluation.protocols import Protocol, PullSpec, find_protocol
 from torchgrasp.evaluation.pull import DIRECTIONS, INTERVAL, PullResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
 from torchgrasp.geometry.frames import rotation_angle
-from torchgrasp.sim.warp_scene import WarpScenes
 
 
 @checked
