@@ -42,6 +42,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.sim)
 
 
+def pytest_runtest_setup() -> None:
+    """Check annotations of the first calls of the next test, too."""
+    annotations.LEFT.clear()
+
+
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)

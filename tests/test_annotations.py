@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tests.annotations import jaxtyped
+from tests.annotations import CALLS, LEFT, jaxtyped
 
 
 def test_each_call_of_a_nested_function_is_checked():
@@ -30,6 +30,22 @@ def test_each_call_of_a_nested_function_is_checked():
     ):
         with pytest.raises(TypeError):
             call()
+
+
+def test_the_first_calls_of_each_test_are_checked():
+    """However often other tests have called the function; the calls of a test are few."""
+
+    @jaxtyped(typechecker=None)
+    def checked(x: 'Float[Tensor, "n"]') -> Tensor:
+        return x
+
+    for _ in range(CALLS):
+        with pytest.raises(TypeError):
+            checked(torch.zeros(2, 2))
+    assert checked(torch.zeros(2, 2)).shape == (2, 2)
+    LEFT.clear()  # as conftest.py does before each test
+    with pytest.raises(TypeError):
+        checked(torch.zeros(2, 2))
 
 
 Later = str | None
