@@ -50,6 +50,12 @@ def test_the_marked_object_of_a_scene_is_held_where_it_is_marked():
     assert plan.best is None and Status.OUTSIDE.sentence in plan.things[0].reason
 
 
+def test_what_is_no_distance_is_told_by_the_name_of_its_argument():
+    for name, wrong in (("keep", lambda x: x), ("avoid", lambda x: 3.0), ("keep", Region(lambda x: x[:, 0] / 0))):
+        with pytest.raises(BadArgument, match=f"^{name}: .*one finite number each"):
+            plan_grasps(VIEW, HAND, starts=4, **{name: wrong})
+
+
 def test_a_region_is_of_one_cloud():
     for name in ("keep", "avoid"):
         with pytest.raises(BadArgument, match=name):

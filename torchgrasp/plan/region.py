@@ -30,6 +30,8 @@ Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 class Region(Value):
     """A region of space in the frame of the cloud; `distance` is any function of points (n, 3) in float64.
 
+    Errors call the function by the `name`.
+
     >>> from torchgrasp import load_object
     >>> ball, rim = Region(lambda points: points.norm(dim=-1) - 0.05), Region.rim(load_object("jug").view, table=0.0)
     >>> ball(torch.tensor([[0.0, 0.0, 0.06]])).round(decimals=3), rim(torch.tensor([0.0, 0.0, 0.01])) > 0
@@ -37,6 +39,7 @@ class Region(Value):
     """
 
     distance: Distance
+    name: str = "distance"
 
     @checked
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -44,7 +47,7 @@ class Region(Value):
         flat = points.detach().double().reshape(-1, 3)
         found = self.distance(flat)
         if not (isinstance(found, Tensor) and found.shape == flat.shape[:1] and bool(torch.isfinite(found).all())):
-            raise BadArgument("distance", f"{show(found)} for {len(flat)} points", "a tensor of one finite number each")
+            raise BadArgument(self.name, f"{show(found)} for {len(flat)} points", "a tensor of one finite number each")
         return found.to(points).reshape(points.shape[:-1])
 
     @classmethod
@@ -108,11 +111,9 @@ class Region(Value):
 
 def combine(keep: Distance | None, avoid: Distance | None, also: Distance | None = None) -> Distance | None:
     """Return the region inside `keep` and `also` and outside `avoid`; None if none is given."""
-    parts = [part if isinstance(part, Region) else Region(part) for part in (keep, also) if part is not None]
-    if avoid is not None:
-        outside = avoid if isinstance(avoid, Region) else Region(avoid)
-        parts.append(Region(lambda points: -outside(points)))
-    return Region(lambda points: functools.reduce(torch.maximum, (x(points) for x in parts))) if parts else None
+    named = ("keep", keep, 1), ("spec.region", also, 1), ("avoid", avoid, -1)
+    parts = [(Region(x.distance if isinstance(x, Region) else x, name), k) for name, x, k in named if x is not None]
+    return Region(lambda x: functools.reduce(torch.maximum, (k * part(x) for part, k in parts))) if parts else None
 
 
 def seen_from(region: Distance | None, obj_from_frame: Float[Tensor, "4 4"]) -> Distance | None:
