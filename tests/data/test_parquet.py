@@ -137,10 +137,12 @@ def test_no_grasps_other_cards_and_no_pyarrow_are_told(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_campaign_without_pyarrow_ends_before_its_trials(
+def test_a_campaign_whose_parquet_cannot_be_written_ends_before_its_trials(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     monkeypatch.setattr("torchgrasp.app.cli.evaluate.import_simulator", lambda _: None)
-    words = ["campaign", str(tmp_path), "--hand", "barrett", "--out", str(tmp_path / "out"), "--parquet", "p"]
+    (tmp_path / "thesis.tex").write_text("years of work")
+    words = ["campaign", str(tmp_path), "--hand", "barrett", "--out", str(tmp_path / "out"), "--parquet", str(tmp_path)]
+    assert cli.main(words) == 2 and "--parquet: expected an empty folder" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     assert cli.main(words) == 2 and "torchgrasp[data]" in capsys.readouterr().err and not (tmp_path / "out").exists()

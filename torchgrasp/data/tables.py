@@ -10,6 +10,8 @@ from torch import Tensor
 from torchgrasp.errors import MissingExtra, Status
 from torchgrasp.files import begin_folder, format_json, hold_folder, render, write_file
 
+SOURCE = "source.json"  # file that says what a folder of tables is made from
+
 
 def import_arrow() -> Any:
     """Return the module pyarrow, with `pyarrow.parquet`; raise `MissingExtra` if it is not installed."""
@@ -50,7 +52,7 @@ def render_card(template: str, **values: Any) -> str:
 def write_folder(folder: Path | str, source: Mapping[str, Any], files: Iterable[tuple[str, str | bytes]]) -> Path:
     """Write files by name, one by one; `source.json` says what they are made from, and keeps other files out."""
     with hold_folder(folder := Path(folder)):
-        begin_folder(folder / "source.json", format_json(source) + "\n", "data")
+        begin_folder(folder / SOURCE, format_json(source) + "\n", "data")
         for name, content in files:
             write_file(folder / name, content)
     return folder

@@ -8,7 +8,7 @@ from torchgrasp.files.write import format_line as format_line, is_file as is_fil
 from torchgrasp.files.write import check_file as check_file, read_bounded as read_bounded, remove_file as remove_file
 from torchgrasp.files.write import render as render, sha256 as sha256, write_file as write_file
 from torchgrasp.files.write import Malformed as Malformed, explain as explain
-from torchgrasp.files.write import LOCK as LOCK, begin_folder as begin_folder
+from torchgrasp.files.write import LOCK as LOCK, begin_folder as begin_folder, check_begun as check_begun
 from torchgrasp.files.write import hold_file as hold_file, hold_folder as hold_folder
 from torchgrasp.files.write import template_engine as template_engine, temporary_folder as temporary_folder
 from torchgrasp.files.values import DTYPES as DTYPES, VERSION as VERSION, Field as Field, Recent as Recent

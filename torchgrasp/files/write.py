@@ -172,14 +172,18 @@ def hold_file(path: Path) -> Iterator[None]:
 
 def begin_folder(path: Path, content: str, what: str) -> None:
     """Write a file that describes its folder; raise `OutputError` if the folder holds other files or other content."""
-    folder = path.parent
-    if path.exists():
-        if path.read_text("utf-8", errors="replace") != content:
-            raise OutputError("folder", f"{folder}, which holds other {what}", f"an empty folder, or the same {what}")
-    elif any(x.name != LOCK for x in folder.iterdir()):
-        raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
-    else:
+    check_begun(path)
+    if not path.exists():
         write_file(path, content)
+    elif path.read_text("utf-8", errors="replace") != content:
+        raise OutputError("folder", f"{path.parent}, which holds other {what}", f"an empty folder, or the same {what}")
+
+
+def check_begun(path: Path) -> None:
+    """Raise `OutputError` if the folder of a describing file has other files and not this one."""
+    folder = path.parent
+    if folder.is_dir() and not path.exists() and any(x.name != LOCK for x in folder.iterdir()):
+        raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
 
 
 @contextlib.contextmanager

@@ -13,14 +13,14 @@ from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
 from torchgrasp.checks import Count, Range, Seed
 from torchgrasp.data import JobRow, read_entries, write_parquet
-from torchgrasp.data.tables import import_arrow
+from torchgrasp.data.tables import SOURCE, import_arrow
 from torchgrasp.errors import BadArgument, DatasetError, Status
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.run import evaluate
 from torchgrasp.evaluation.score import ViewScore, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
-from torchgrasp.files import format_columns, format_json, format_line, hold_folder, write_file
+from torchgrasp.files import check_begun, format_columns, format_json, format_line, hold_folder, write_file
 from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
 
 OBJECTS_HELP = "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
@@ -186,6 +186,8 @@ class Campaign(_Trials):
         import_simulator(self.simulator)
         if self.parquet is not None:
             import_arrow()  # not after hours
+            with naming(folder="--parquet"):
+                check_begun(self.parquet / SOURCE)
         if self.fingers == "auto":
             raise BadArgument("--fingers", "auto", "one set of fingers for all records")
         hand, _ = load_fingers(self.hand, self.fingers)
