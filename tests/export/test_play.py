@@ -20,7 +20,7 @@ import trimesh
 from benchmarks.close.play import PLAYERS, ROOT, play_all
 from scipy.spatial import ConvexHull
 
-from torchgrasp import load_hand, load_object
+from torchgrasp import fit_shape, load_hand, load_object
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.errors import BadArgument, MeshError
@@ -29,6 +29,7 @@ from torchgrasp.export import save_play
 from torchgrasp.export.play import pressing_force
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.shape import extract_surface
 from torchgrasp.specs import TrialSpec
 
 CASES = [(name, hand, mass) for mass in (0.25, 4.0) for name in ("jug", "cylinder") for hand in ("allegro", "barrett")]
@@ -218,8 +219,26 @@ def test_the_command_plays_on_the_estimated_surface(tmp_path, capsys):
     assert cli.main(words) == 0 and str(out) in capsys.readouterr().out
     solid = trimesh.load(out / "object.ply")
     assert solid.is_watertight and solid.extents == pytest.approx(load_object("cylinder").mesh.extents, abs=0.02)
-    base = solid.vertices[solid.vertices[:, 2] < solid.bounds[0, 2] + 1e-6, :2]  # on a round base it would rock
-    assert ConvexHull(base).volume > 0.5 * ConvexHull(solid.vertices[:, :2]).volume
+    assert share_of_base(solid) > 0.5
+
+
+def share_of_base(solid):
+    """Return the area of the base over that of the shadow: on a round base a body would rock."""
+    base = solid.vertices[solid.vertices[:, 2] < solid.bounds[0, 2] + 1e-6, :2]
+    return ConvexHull(base).volume / ConvexHull(solid.vertices[:, :2]).volume
+
+
+def test_an_estimate_stands_on_the_table_and_a_true_mesh_stays_as_it_is(tmp_path):
+    thing, hand, grasp = load_object("cylinder"), load_hand("barrett"), load_shipped_grasp("cylinder", "barrett")
+    surface = extract_surface(fit_shape(thing.view, table=0.0), 24)
+    parts, low = [thing.mesh.convex_hull], thing.mesh.copy().apply_translation([0, 0, -0.003])
+    found = [
+        trimesh.load(save_play(hand, grasp, tmp_path / str(k), "mujoco", mesh, SPEC, parts=parts) / "object.ply")
+        for k, mesh in enumerate((surface, low))
+    ]
+    assert surface.vertices[:, 2].min() < -1e-4 and found[0].bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
+    assert share_of_base(found[0]) > 0.5
+    np.testing.assert_allclose(found[1].bounds, low.bounds, atol=1e-6)
 
 
 def test_the_parts_of_another_object_in_the_folder_are_not_used(tmp_path):

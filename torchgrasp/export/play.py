@@ -19,11 +19,12 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import render, write_file
 from torchgrasp.geometry.frames import inverse, rotation_from_rpy
-from torchgrasp.geometry.plane import upright_frame
+from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import Joint, Link, Shape
 from torchgrasp.ik.motion import opened_pose
 from torchgrasp.lazy import spatial, trimesh
+from torchgrasp.shape.surface import Surface
 from torchgrasp.sim.convex_parts import hull, read_solid
 from torchgrasp.sim.mujoco_scene import scene_mjcf
 from torchgrasp.sim.sapien_bodies import split_hull
@@ -44,7 +45,7 @@ def save_play(
     grasps: Grasps,
     folder: Path | str,
     player: Player,
-    mesh: "trimesh.Trimesh | Path | str",
+    mesh: "Surface | trimesh.Trimesh | Path | str",
     spec: TrialSpec | None = None,
     *,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
@@ -60,7 +61,7 @@ def save_play(
         grasps: one or more grasps of the hand.
         folder: the folder to write.
         player: the simulator.
-        mesh: closed mesh of the object [m] in the frame of the grasps: the true one, or the estimated surface.
+        mesh: closed mesh of the object [m] in the frame of the grasps; or the estimated surface, which then stands.
         spec: mass, friction, force, stiffness, heights, times and timestep; `TrialSpec()` by default.
         parts: convex parts of the mesh; by default they are computed (`convex_parts`).
 
@@ -77,7 +78,7 @@ def save_play(
     if not len(grasps):
         raise BadArgument("grasps", "none", "at least one grasp")
     hand, grasps, spec, folder = hand.to("cpu"), grasps.to("cpu", torch.float64), spec or TrialSpec(), Path(folder)
-    solid, pieces = read_solid(mesh, parts)
+    solid, pieces = read_solid(stand(mesh, grasps.table).mesh() if isinstance(mesh, Surface) else mesh, parts)
     world_from_obj = _world_from_obj(grasps, solid)
     if not torch.equal(world_from_obj, torch.eye(4, dtype=torch.float64)):
         solid, *pieces = (body.copy().apply_transform(world_from_obj.numpy()) for body in (solid, *pieces))
@@ -101,6 +102,14 @@ def save_play(
         name = path.name.removeprefix(player).removesuffix(".py.txt").removeprefix("_") or "play"
         write_file(folder / f"{name}.py", path.read_text("utf-8"))
     return folder
+
+
+def stand(surface: Surface, table: Plane | None) -> Surface:
+    """Return an estimate whose points below the table are moved up to it: on its round base it would rock."""
+    if table is None:
+        return surface
+    below = table.height(surface.vertices).clamp(max=0)[:, None] * table.normal.to(surface.vertices)
+    return dataclasses.replace(surface, vertices=surface.vertices - below)
 
 
 def _world_from_obj(grasps: Grasps, mesh: "trimesh.Trimesh") -> Float[Tensor, "4 4"]:

@@ -1,6 +1,5 @@
 """The commands `torchgrasp export` and `torchgrasp import`: grasps in the formats of other programs."""
 
-import contextlib
 import functools
 import inspect
 import itertools
@@ -9,11 +8,10 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import torch
 
 from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
-from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, find_cloud, load_fingers
+from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
 from torchgrasp.app.report.glb import write_glb
 from torchgrasp.checks import Count
 from torchgrasp.cloud import read_cloud
@@ -22,12 +20,9 @@ from torchgrasp.errors import BadArgument, ModelFileError, Status
 from torchgrasp.export.foreign import Quaternion, read_poses
 from torchgrasp.files import read_json, write_file
 from torchgrasp.geometry.mesh import read_mesh
-from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
-from torchgrasp.lazy import trimesh
 from torchgrasp.planner.problem import digest
-from torchgrasp.shape import Surface, extract_surface, fit_shape
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Grasps, PointCloud, load_grasps
 
@@ -70,7 +65,7 @@ class Export(Command):
     object: str | None = option(
         None,
         "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the object's id; "
-        "glb, play-..., usd: a mesh, or the plan's cloud for the estimated surface; by default surface.ply of GRASPS",
+        "glb, play-..., usd: a mesh; by default the estimated surface.ply of GRASPS",
     )
     mass: float | None = option(None, "play-..., usd: mass of the object [kg]; by default 0.1")
     friction: float | None = option(None, "play-..., usd: coefficient of friction; by default 0.8")
@@ -112,40 +107,19 @@ class Export(Command):
             if plays and len(best):
                 player: Any = self.format.removeprefix("play-")
                 spec = TrialSpec(force=self.force, kp=self.kp, **trial)
-                mesh = self._body(planned, body)
-                if isinstance(mesh, Surface) or body == shown:
-                    mesh = stand(mesh.mesh() if isinstance(mesh, Surface) else mesh, planned.table)
-                formats.save_play(hand, best, self.out, player, mesh, spec)
+                formats.save_play(hand, best, self.out, player, body, spec)
             elif self.format == "dexgraspbench":
                 stiffness = {} if self.kp is None else {"kp": self.kp}
                 formats.save_dexgraspbench(hand, best, self.out, str(self.object), force, **stiffness)
             elif self.format == "glb":
                 if len(best):
-                    write_glb(self.out, hand, best[0], self._body(planned, body))
+                    write_glb(self.out, hand, best[0], read_mesh(body))
             elif self.format == "graspgen":
                 write_file(self.out, formats.format_graspgen(best, str(self.object)))
             elif self.format in TEXTS:
                 write_file(self.out, TEXTS[self.format](hand, best, force, self.kp, **robot))
         print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
         return 0 if len(best) else 1
-
-    def _body(self, planned: Grasps, path: Path) -> "Surface | trimesh.Trimesh":
-        """Read the object of glb or play: a mesh, or the surface that the cloud of the plan tells."""
-        path = find_cloud(path, "--object")
-        with contextlib.suppress(BadArgument):
-            cloud = read_cloud(path)
-            if digest(cloud) == planned.meta.get("cloud_sha256"):
-                return extract_surface(fit_shape(cloud, seed=int(planned.meta["seed"]), table=planned.table))
-        with naming(mesh="--object (a mesh, or the cloud of the plan)"):
-            return read_mesh(path)
-
-
-def stand(mesh: "trimesh.Trimesh", table: Plane | None) -> "trimesh.Trimesh":
-    """Return a mesh whose points below the table are moved up to it: the round base of an estimate would rock."""
-    if table is None:
-        return mesh
-    below = table.height(torch.from_numpy(np.array(mesh.vertices))).clamp(max=0)[:, None] * table.normal.double()
-    return trimesh.Trimesh(mesh.vertices - below.numpy(), mesh.faces, process=False)
 
 
 def read_names(words: Sequence[str]) -> dict[str, str] | None:

@@ -18,6 +18,7 @@ from torchgrasp.data.shipped import DATA, list_objects, load_object
 from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.export import save_surface
+from torchgrasp.export.play import stand
 from torchgrasp.files import format_columns, format_line, sha256
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import as_plane
@@ -244,7 +245,7 @@ class Grasp(Command):
         paths = [out / "grasps.safetensors"]
         run.grasps.save(paths[0])
         if len(run.executable):
-            paths.append(save_surface(run.surface, out / "surface.ply"))
+            paths.append(save_surface(stand(run.surface, run.grasps.table), out / "surface.ply"))
         if not self.no_report:
             paths += [write_report(out / "report.html", run, VIEW), write_viewer(out / VIEW, run)]
         if self.rerun:
