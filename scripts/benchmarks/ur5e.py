@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from torchgrasp.arm import Arm, load_arm
+from torchgrasp.data.accept import HandLike
 from torchgrasp.geometry.frames import rotation_from_rpy
-from torchgrasp.hand.hand import Hand
 
 A = (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0)  # [m]
 D = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)  # [m]
@@ -93,7 +93,7 @@ def by_products(joints: np.ndarray) -> np.ndarray:
     return pose
 
 
-def ur5e(hand: Hand, place: tuple[float, float, float] = (-0.55, 0.0, 0.0), seed: int = 0) -> Arm:
+def ur5e(hand: HandLike, place: tuple[float, float, float] = (-0.55, 0.0, 0.0), seed: int = 0) -> Arm:
     """Return the arm with a hand on its flange, whose root is 95 mm away; its base stands at a place [m]."""
     base, mount = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
     base[:3, 3], mount[2, 3] = torch.tensor(place, dtype=torch.float64), 0.095

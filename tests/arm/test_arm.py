@@ -9,11 +9,14 @@ import trimesh
 from benchmarks.ur5e import by_products, ur5e, ur5e_urdf
 
 from tests.make import random_motion
+from torchgrasp import load_object, plan_grasps
 from torchgrasp.app.author import clean_arm
 from torchgrasp.arm import load_arm
 from torchgrasp.arm.reach import measure_ease, reach_poses
 from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.geometry.frames import inverse
+from torchgrasp.planner.changes import list_changes
+from torchgrasp.planner.request import Request
 
 
 def test_poses_are_products_of_the_published_matrices(arm):
@@ -55,6 +58,18 @@ def test_poses_out_of_reach_are_refused(arm):
 
 def test_same_seed_same_library(arm, hand):
     assert torch.equal(arm.library, ur5e(hand).library) and not torch.equal(arm.library, ur5e(hand, seed=1).library)
+
+
+def test_an_arm_is_for_the_hand_that_is_named(arm, hand, monkeypatch):
+    named = ur5e("allegro")
+    assert torch.equal(named.center, arm.center) and named.hand_sha256 == arm.hand_sha256
+    with pytest.raises(BadArgument, match=r"^hand: .*'octopus'"):
+        ur5e("octopus")
+    monkeypatch.setattr("torchgrasp.planner.grasps.plan_request", None)  # no work is begun
+    with pytest.raises(BadArgument, match=r"^arm: expected .* barrett hand"):
+        plan_grasps(load_object("cylinder"), "barrett", arm=arm)
+    changes = list_changes(Request(load_object("cylinder").view, hand, arm=arm))
+    assert all(change.request.hand.name == hand.name for change in changes)  # another hand would need another arm
 
 
 def test_files_that_are_no_arm_are_refused(hand, tmp_path):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgrasp.base import Value
 from torchgrasp.checks import Pose, Seed, checked
+from torchgrasp.data.accept import HandLike, as_hand
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, real
 from torchgrasp.hand.collision_shapes import ALWAYS, cover
@@ -29,6 +30,7 @@ class Arm(Value):
     `urdf` is the chain of links from base to tip. `speed` [rad/s] is the greatest of each joint. The s collision
     spheres [m] are those of the links, then those of the hand's palm. Those of `moving` links keep clear of table and
     objects, and the `pairs` of each other. `library` holds m random postures, with the features of their tips.
+    `hand_sha256` names the files of the hand.
     """
 
     urdf: Urdf = dataclasses.field(repr=False)
@@ -45,6 +47,7 @@ class Arm(Value):
     pairs: Int[Tensor, "p 2"]
     library: Float[Tensor, "m n"]
     features: Float[Tensor, "m 12"]
+    hand_sha256: str
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -99,7 +102,7 @@ def features(tip: Float[Tensor, "3 4 k"]) -> Float[Tensor, "k 12"]:
 @checked
 def load_arm(
     urdf: Path | str,
-    hand: Hand,
+    hand: HandLike,
     tip: str | None = None,
     *,
     obj_from_base: Pose | None = None,
@@ -110,7 +113,7 @@ def load_arm(
 
     Args:
         urdf: path of the file; a joint without limits gets one turn either way.
-        hand: the hand on the arm.
+        hand: the hand on the arm, or its name or folder.
         tip: the link that carries the hand; by default the one that most joints move, the last of equals.
         obj_from_base: pose of the arm's root link in the frame of the cloud; by default the same frame.
         tip_from_hand: pose of the hand's root link in the frame of the tip; by default the same frame.
@@ -120,13 +123,12 @@ def load_arm(
     `clean_arm` replaces, and no joint without a drive. Raises `BadArgument` for a tip that fewer than six joints move.
 
     >>> from torchgrasp import load_hand
-    >>> hand = load_hand("allegro")
-    >>> load_arm(hand.urdf_path, hand, "thumb_tip")
+    >>> load_arm(load_hand("allegro").urdf_path, "allegro", "thumb_tip")
     Traceback (most recent call last):
         ...
     torchgrasp.errors.BadArgument: tip: expected a link that at least six joints move, got 'thumb_tip'
     """
-    whole = read_published(urdf)
+    hand, whole = as_hand(hand, "hand"), read_published(urdf)
     named = {link.name: link for link in whole.links}
     tip = max(reversed(named), key=lambda name: len(whole.movers(name))) if tip is None else tip
     if tip not in named or len(whole.movers(tip)) < 6:
@@ -156,7 +158,10 @@ def load_arm(
     above = tree.moves.sum(1).long()[link]  # the number of joints that move each sphere
     moving, pairs = torch.nonzero((above > 0) & ~palm)[:, 0], torch.nonzero(above - above[:, None] > 1)
     found = features(tree.frames(library.T.contiguous())[:, :, -1])
-    arm = Arm(chain, tree, lower, upper, speed, base, mount, link, center, radius, moving, pairs, library, found)
+    arm = Arm(
+        chain, tree, lower, upper, speed, base, mount, link, center, radius, moving, pairs, library, found,
+        hand.source.sha256,
+    )  # fmt: skip
     met = arm.overlaps(arm.sphere_centres(library[:200].T))
     bodies, owner = torch.unique((link + palm)[pairs], dim=0, return_inverse=True)
     often = torch.zeros(len(bodies), met.shape[1]).index_add(0, owner, met.float()).gt(0).float().mean(1)

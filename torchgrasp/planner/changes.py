@@ -72,8 +72,8 @@ def _fingers(request: Request) -> Iterator[Change]:
 
 
 def _hands(request: Request) -> Iterator[Change]:
-    """Yield a change to each other shipped hand, except variants such as the left hand; only in mode "joint"."""
-    if request.mode != "joint":
+    """Yield a change to each other shipped hand, except variants such as the left; in mode "joint", without an arm."""
+    if request.mode != "joint" or request.arm is not None:
         return
     names = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))
     for name in names:

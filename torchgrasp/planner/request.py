@@ -92,7 +92,11 @@ class Request:
     time_budget: Budget | None = None
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` for no load, and for a promise about an object elsewhere, which no trials support."""
+        """Raise `BadArgument` for an arm of another hand, no load, and a promise that no trials support."""
+        if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
+            raise BadArgument(
+                "arm", "an arm with another hand", f"one that load_arm gave for the {self.hand.name} hand"
+            )
         if isinstance(self.resist, tuple) and not self.resist:
             raise BadArgument("resist", "no load", "at least one, or None")
         if self.promise is not None and self.grasp_task.displaced:
