@@ -93,11 +93,13 @@ def by_products(joints: np.ndarray) -> np.ndarray:
     return pose
 
 
-def ur5e(hand: HandLike, place: tuple[float, float, float] = (-0.55, 0.0, 0.0), seed: int = 0) -> Arm:
+def ur5e(
+    hand: HandLike, place: tuple[float, float, float] = (-0.55, 0.0, 0.0), seed: int = 0, *, urdf: str | None = None
+) -> Arm:
     """Return the arm with a hand on its flange, whose root is 95 mm away; its base stands at a place [m]."""
     base, mount = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
     base[:3, 3], mount[2, 3] = torch.tensor(place, dtype=torch.float64), 0.095
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "ur5e.urdf")
-        file.write_text(ur5e_urdf())
+        file.write_text(urdf or ur5e_urdf())
         return load_arm(file, hand, obj_from_base=base, tip_from_hand=mount, seed=seed)

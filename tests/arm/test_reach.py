@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 import yaml
-from benchmarks.ur5e import ur5e
+from benchmarks.ur5e import ur5e, ur5e_urdf
 
 from tests.make import distance_field, random_motion, real
 from torchgrasp import ContactSpec, Plane, Status, load_object, plan_grasps
@@ -60,6 +60,24 @@ def test_links_keep_clear_of_table_objects_and_each_other(arm, hand, good):
     folded[2] = 3.1  # the forearm beside the upper arm, the wrist at the shoulder
     assert not arm.overlaps(arm.sphere_centres(0 * folded)).any()
     assert arm.overlaps(arm.sphere_centres(folded)).any()
+
+
+def test_a_base_on_a_rail_stands_on_the_table_and_keeps_clear_of_objects(arm, hand, good):
+    rail = """<link name="rail"/><joint name="slide" type="prismatic"><parent link="rail"/><child link="base_link"/>
+        <axis xyz="0 1 0"/><limit lower="-0.4" upper="0.4" effort="100" velocity="0.5"/></joint>"""
+    sliding = ur5e(hand, urdf=ur5e_urdf().replace('<robot name="ur5e">', f'<robot name="ur5e">{rail}'))
+    way, found, _ = follow_grasps(sliding, hand, good, TABLE)
+    assert found.double().mean() > 0.5 and way[found][..., 0].std() > 0.05
+    wanted = way_of(hand, good, TABLE)[found]
+    assert torch.allclose(sliding.hand_poses(way[found].flatten(0, 1)).view_as(wanted), wanted, atol=2e-4)
+    turned, base = sliding.link[sliding.moving] > 1, sliding.link[sliding.moving] == 1
+    centres = sliding.sphere_centres(way[found].flatten(0, 1).T)
+    lowest = centres[2, sliding.moving].amin(1) - sliding.radius[sliding.moving]
+    assert lowest[turned].min() >= 0 > lowest[base].min()
+    place = real([-0.55, 0, 0])
+    beam = distance_field(lambda x: (x - place)[..., ::2].norm(dim=-1) - 0.05, place, 0.7, 0.02)
+    world = dataclasses.replace(TABLE, field=beam)  # along the rail, lower than the shoulder
+    assert not follow_grasps(sliding, hand, good, world)[1].any() and follow_grasps(arm, hand, good, world)[1].all()
 
 
 def test_an_arm_far_away_reaches_nothing_and_the_planner_says_so(hand):

@@ -28,9 +28,9 @@ class Arm(Value):
     """A robot arm that carries a hand, from `load_arm`. Postures (k, n) hold n joints [rad], from the base to the tip.
 
     `urdf` is the chain of links from base to tip. `speed` [rad/s] is the greatest of each joint. The s collision
-    spheres [m] are those of the links, then those of the hand's palm. Those of `moving` links keep clear of table and
-    objects, and the `pairs` of each other. `library` holds m random postures, with the features of their tips.
-    `hand_sha256` names the files of the hand.
+    spheres [m] are those of the links, then those of the hand's palm. Those of `moving` links keep clear of objects
+    and, if they turn, of the table; the `pairs` of each other. `library` holds m random postures, with the features of
+    their tips. `hand_sha256` names the files of the hand.
     """
 
     urdf: Urdf = dataclasses.field(repr=False)

@@ -105,8 +105,10 @@ def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> 
     centres = arm.sphere_centres(path.flatten(0, 1).T).unflatten(2, path.shape[:2])
     links, radius = centres[:, arm.moving].permute(2, 3, 1, 0), arm.radius[arm.moving]
     clear = torch.ones_like(path[:, 0, 0], dtype=torch.bool)
-    if world.plane is not None:
-        clear &= (along(links, world.plane) - radius).flatten(1).amin(1) >= world.plane.offset
+    if world.plane is not None:  # what only slides, as a base on a rail, may stand on the table
+        turns = (arm.tree.moves @ (1 - arm.tree.prismatic))[arm.link[arm.moving]] > 0
+        height = along(links[:, :, turns], world.plane) - radius[turns]
+        clear &= height.flatten(1).amin(1) >= world.plane.offset
     if world.field is not None:  # a lifted object is not in the way
         clear &= (world.field.query(links[:, : COARSE_STEPS + 2])[0] - radius).flatten(1).amin(1) >= 0
     if world.obstacles is not None and world.guarded:
