@@ -7,10 +7,10 @@ from torchgrasp.errors import GraspError, Status
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.specs import ContactSpec, TrialSpec
 from torchgrasp.values import Certificate, ContactCode, ContactPlan, Contacts, Grasps, PointCloud, ShapeEstimate
-from torchgrasp.values import load_grasps
 from torchgrasp.closure import ClosureResult, SensorModel
 from torchgrasp.cloud import cloud_from_array, cloud_from_depth, merge_clouds, read_cloud
 from torchgrasp.scene import Scene, read_scene, save_scene
+from torchgrasp.data.shards import load_grasps
 from torchgrasp.data.shipped import list_objects, load_object, load_scene
 from torchgrasp.shape import ShapeGP, fit_shape
 from torchgrasp.plan import Region, certify, closure_probability, plan_contacts

@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import FINGERTIPS, Batch, Value, named_tensors, read_rows
-from torchgrasp.checks import ANY, Poses, Rows, checked, is_rigid
-from torchgrasp.errors import BadArgument, FailedRows, ModelFileError, Status, TooFewPoints
-from torchgrasp.files import read_value, save_tensors
+from torchgrasp.base import Batch, Value, named_tensors, read_rows
+from torchgrasp.checks import ANY, Poses, Rows, checked
+from torchgrasp.errors import BadArgument, FailedRows, Status, TooFewPoints
+from torchgrasp.files import save_tensors
 from torchgrasp.geometry.plane import Plane, read_plane
 
 
@@ -290,33 +290,3 @@ def format_success(success: "Grasps | float") -> str:
     """Return a predicted success as a percentage, or "unknown" for NaN; of grasps, the success of the first."""
     number = float(success.success[0]) if isinstance(success, Grasps) else success
     return "unknown" if number != number else f"{number:.0%}"
-
-
-@checked
-def load_grasps(path: Path | str) -> Grasps:
-    """Read grasps that `Grasps.save` wrote.
-
-    Raises `ModelFileError` if the file is missing, or a pose, a status or the number of contacts is not valid.
-
-    >>> import tempfile
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> load_shipped_grasp("jug", "barrett").save(file := Path(tempfile.mkdtemp(), "grasps.safetensors"))
-    >>> load_grasps(file).meta["hand"]
-    'barrett'
-    """
-    grasps, meta = read_value(path, "grasps", Grasps, meta={})
-    check_grasps(path, grasps)
-    return dataclasses.replace(grasps, meta=meta)
-
-
-def check_grasps(path: Path | str, grasps: Grasps) -> None:
-    """Raise `ModelFileError` if grasps from a file cannot have been written by `Grasps.save`."""
-    f = grasps.contacts.fingertips
-    wrong = {
-        f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]], device="cpu"),
-        "obj_from_hand that is not rigid": ~is_rigid(grasps.obj_from_hand),
-        "an unknown status": ~torch.isin(grasps.status, torch.tensor([int(status) for status in Status], device="cpu")),
-        "a permutation that is none": (grasps.permutation.sort(1).values != torch.arange(f, device="cpu")).any(1),
-    }
-    for found in (name for name, rows in wrong.items() if bool(rows.any())):
-        raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")

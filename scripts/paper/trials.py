@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
+from torchgrasp import load_grasps
 from torchgrasp.control.reference import check_single
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import list_objects, load_object
@@ -32,7 +33,7 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.success.order import rank_by_variance
-from torchgrasp.values import Grasps, PointCloud, load_grasps
+from torchgrasp.values import Grasps, PointCloud
 
 if TYPE_CHECKING:
     import trimesh

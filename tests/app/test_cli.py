@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from tests.make import run_python
-from torchgrasp import GraspTask
+from torchgrasp import GraspTask, load_grasps
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasps, inputs
 from torchgrasp.app.cli.evaluate import print_score
@@ -18,7 +18,6 @@ from torchgrasp.app.cli.inputs import check_folder
 from torchgrasp.data.shipped import DATA
 from torchgrasp.errors import MissingExtra
 from torchgrasp.evaluation.score import ViewScore
-from torchgrasp.values import load_grasps
 
 VIEW = str(DATA / "cylinder" / "view.ply")
 MESH = str(DATA / "cylinder" / "mesh.ply")

@@ -15,7 +15,7 @@ import trimesh
 import torchgrasp
 from tests.make import real
 from tests.pinch import cylinder, pinch
-from torchgrasp import ContactSpec, Plane, TrialSpec, load_object, plan_grasps
+from torchgrasp import ContactSpec, Plane, TrialSpec, load_grasps, load_object, plan_grasps
 from torchgrasp.control import ClosingReference, GraspController, Observation
 from torchgrasp.data.accept import as_cloud
 from torchgrasp.errors import BadArgument
@@ -27,7 +27,7 @@ from torchgrasp.marks import Taken
 from torchgrasp.sim import Neighbour
 from torchgrasp.sim.scene import Scene
 from torchgrasp.sim.scene_spec import Body, SceneSpec
-from torchgrasp.values import PointCloud, load_grasps
+from torchgrasp.values import PointCloud
 
 TILT = math.radians(2)
 WRONG = Plane(torch.tensor([math.sin(TILT), 0.0, math.cos(TILT)], dtype=torch.float64), 0.003)

@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp import PointCloud
+from torchgrasp import PointCloud, load_grasps
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data import list_views, read_entries, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import load_shipped_grasp
@@ -21,7 +21,6 @@ from torchgrasp.evaluation import EvaluationSpec, Protocol, evaluate
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.evaluation.views import View
 from torchgrasp.hand.load import load_hand
-from torchgrasp.values import load_grasps
 
 POSE = [[1.0, 0.0, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
 GOOD = {"views": {"v0": {"T_object_camera": POSE}}}

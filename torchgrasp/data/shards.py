@@ -1,4 +1,4 @@
-"""A shard: one file with the records of several jobs of a campaign. A job is one object and view."""
+"""Files of grasps: of a plan, or a shard with the records of a campaign's jobs. A job is one object and view."""
 
 import dataclasses
 import functools
@@ -12,11 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, map_tensors, named_tensors
+from torchgrasp.base import FINGERTIPS, Value, map_tensors, named_tensors
+from torchgrasp.checks import checked, is_rigid
 from torchgrasp.errors import ModelFileError, Status
 from torchgrasp.files import Field, pack_tensors, read_value
 from torchgrasp.limits import JSON_LETTERS
-from torchgrasp.values import Grasps, check_grasps
+from torchgrasp.values import Grasps
 
 KIND = "grasp-shard"  # kind of the file
 MOST = 1_000_000  # most points, grasps and tries of one job
@@ -129,3 +130,33 @@ def short(text: str) -> str:
     """Return a text on one line, cut to the largest length that `read_row` accepts."""
     line = " ".join(text.split())
     return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."
+
+
+@checked
+def load_grasps(path: Path | str) -> Grasps:
+    """Read grasps that `Grasps.save` wrote.
+
+    Raises `ModelFileError` if the file is missing, or a pose, a status or the number of contacts is not valid.
+
+    >>> import tempfile
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> load_shipped_grasp("jug", "barrett").save(file := Path(tempfile.mkdtemp(), "grasps.safetensors"))
+    >>> load_grasps(file).meta["hand"]
+    'barrett'
+    """
+    grasps, meta = read_value(path, "grasps", Grasps, meta={})
+    check_grasps(path, grasps)
+    return dataclasses.replace(grasps, meta=meta)
+
+
+def check_grasps(path: Path | str, grasps: Grasps) -> None:
+    """Raise `ModelFileError` if grasps from a file cannot have been written by `Grasps.save`."""
+    f = grasps.contacts.fingertips
+    wrong = {
+        f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]], device="cpu"),
+        "obj_from_hand that is not rigid": ~is_rigid(grasps.obj_from_hand),
+        "an unknown status": ~torch.isin(grasps.status, torch.tensor([int(status) for status in Status], device="cpu")),
+        "a permutation that is none": (grasps.permutation.sort(1).values != torch.arange(f, device="cpu")).any(1),
+    }
+    for found in (name for name, rows in wrong.items() if bool(rows.any())):
+        raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")

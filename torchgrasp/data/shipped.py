@@ -7,11 +7,12 @@ import numpy as np
 
 from torchgrasp.checks import checked
 from torchgrasp.cloud.read import read_cloud
+from torchgrasp.data.shards import load_grasps
 from torchgrasp.errors import BadArgument
 from torchgrasp.lazy import trimesh
 from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.scene import Scene
-from torchgrasp.values import Grasps, PointCloud, load_grasps
+from torchgrasp.values import Grasps, PointCloud
 
 __all__ = ["GraspObject", "list_objects", "load_object", "load_scene", "load_shipped_grasp"]
 

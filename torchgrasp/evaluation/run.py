@@ -10,6 +10,7 @@ from typing import Annotated
 
 from torchgrasp.checks import Range, checked
 from torchgrasp.data.manifest import read_entries
+from torchgrasp.data.shards import load_grasps
 from torchgrasp.errors import DatasetError, Status
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.score import ProtocolResult, ViewScore
@@ -17,7 +18,6 @@ from torchgrasp.evaluation.views import REFUSAL, EvaluationSpec, View, choose_ro
 from torchgrasp.files import hold_folder, temporary_folder
 from torchgrasp.hand.hand import Hand
 from torchgrasp.jobs import run_tasks
-from torchgrasp.values import load_grasps
 
 PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0  # limits of the wall time [s] of planning on a view and of an attempt
 

@@ -19,6 +19,7 @@ from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.camera import look_at
 from torchgrasp.data import read_entry, read_object_mesh, read_view
+from torchgrasp.data.shards import load_grasps
 from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.protocols import Protocol, draw_error, draw_slide, seed_of
 from torchgrasp.evaluation.pull import run_protocol
@@ -36,7 +37,7 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Grasps, PointCloud, load_grasps
+from torchgrasp.values import Grasps, PointCloud
 
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
 Ranks = Literal["best", "spread"]

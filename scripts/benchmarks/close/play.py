@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.common import ROOT, Options, Row, bench
+from torchgrasp import load_grasps
 from torchgrasp.data import list_views, read_object_mesh
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, evaluate
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
@@ -21,7 +22,6 @@ from torchgrasp.export import save_play
 from torchgrasp.export.play import pressing_force
 from torchgrasp.hand.load import load_hand
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.values import load_grasps
 
 PLAYERS = {
     "MuJoCo 3": ("mujoco", ".venv"),

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.campaign.cheap import records
-from torchgrasp import load_hand, load_object, plan_grasps
+from torchgrasp import load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.app.cli import evaluate as evaluate_command
 from torchgrasp.app.cli import grasps as grasp_command
 from torchgrasp.app.cli import hands as hand_commands
@@ -25,7 +25,6 @@ from torchgrasp.evaluation.score import ProtocolResult, ViewScore
 from torchgrasp.evaluation.views import EvaluationSpec, View
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.specs import ContactSpec
-from torchgrasp.values import load_grasps
 
 POSE = [[1.0, 0.0, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
 

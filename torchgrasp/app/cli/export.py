@@ -16,6 +16,7 @@ from torchgrasp.app.report.glb import write_glb
 from torchgrasp.checks import Count
 from torchgrasp.cloud import read_cloud
 from torchgrasp.cloud.agreement import check_agreement
+from torchgrasp.data.shards import load_grasps
 from torchgrasp.errors import BadArgument, ModelFileError, Status
 from torchgrasp.export.foreign import Quaternion, read_poses
 from torchgrasp.files import read_json, write_file
@@ -24,7 +25,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.problem import digest
 from torchgrasp.specs import ContactSpec, TrialSpec
-from torchgrasp.values import Grasps, PointCloud, load_grasps
+from torchgrasp.values import Grasps, PointCloud
 
 Unit = Literal["m", "cm", "mm"]
 TEXTS: dict[str, Callable[..., str]] = {
