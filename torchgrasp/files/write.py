@@ -182,7 +182,7 @@ def begin_folder(path: Path, content: str, what: str) -> None:
 def check_begun(path: Path) -> None:
     """Raise `OutputError` if the folder of a describing file has other files and not this one."""
     folder = path.parent
-    if folder.is_dir() and not path.exists() and any(x.name != LOCK for x in folder.iterdir()):
+    if not path.exists() and {*folder.glob("*")} - {folder / LOCK, *folder.glob(f".*{ENDING}")}:
         raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
 
 
