@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import runpy
@@ -17,13 +18,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from benchmarks.close.play import PLAYERS, ROOT, play_all
+from benchmarks.close.play import LEAST_SAME, PLAYERS, ROOT, play_all
 from scipy.spatial import ConvexHull
 
-from torchgrasp import fit_shape, load_hand, load_object
+from torchgrasp import ContactSpec, fit_shape, load_hand, load_object, plan_grasps
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument, MeshError
+from torchgrasp.errors import BadArgument, MeshError, Status
 from torchgrasp.evaluation import close_hand
 from torchgrasp.export import save_play
 from torchgrasp.export.play import pressing_force
@@ -32,8 +33,9 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.shape import extract_surface
 from torchgrasp.specs import TrialSpec
 
-CASES = [(name, hand, mass) for mass in (0.25, 4.0) for name in ("jug", "cylinder") for hand in ("allegro", "barrett")]
-"""Objects, hands and masses [kg]: the heavy ones are beyond what the joints can press."""
+OBJECTS, HANDS, MASSES = ("jug", "cylinder", "rabbit", "spray"), ("allegro", "barrett"), (0.25, 4.0)
+"""Objects, hands and masses [kg]: the heavy ones are beyond what most joints can press."""
+EACH = 4  # grasps of an object by a hand with a mass
 SPEC = TrialSpec(approach=0.05, hold_time=0.3)
 LIBRARIES = {
     "mujoco": {"mujoco", "numpy"},
@@ -70,11 +72,20 @@ def export(folder, player, name, hand, mass):
 
 
 @functools.cache
-def own_verdict(name, hand, mass):
-    """Return whether our trial of the same motion, in SAPIEN, lifts the object by half of the lift."""
-    thing, grasp = load_object(name), load_shipped_grasp(name, hand)
-    trial = dataclasses.replace(spec_of(mass), closing="open_loop")
-    return close_hand(grasp, load_hand(hand), thing.mesh, trial, parts=thing.parts).rise >= 0.5 * trial.lift_height
+def planned(name, hand):
+    """Return the executable grasps of an object's view, the best ones first: as many as all masses need."""
+    grasps = plan_grasps(load_object(name), hand, ContactSpec(table=0.0), 60)[: EACH * len(MASSES)]
+    assert len(grasps) == EACH * len(MASSES) and bool((grasps.status == Status.OK).all())
+    return grasps
+
+
+@functools.cache
+def own_verdicts(name, hand, k):
+    """Return whether our trials of the same motion lift the object with mass k by half of the lift."""
+    thing, grasps = load_object(name), planned(name, hand)[k :: len(MASSES)]
+    trial = dataclasses.replace(spec_of(MASSES[k]), closing="open_loop", simulator="mujoco")
+    found = [close_hand(grasp, hand, thing.mesh, trial, parts=thing.parts) for grasp in grasps]
+    return [x.rise >= 0.5 * trial.lift_height for x in found]
 
 
 @pytest.mark.sim
@@ -83,11 +94,15 @@ def test_a_simulator_has_the_verdict_of_our_trial(name, tmp_path):
     player, environment = PLAYERS[name]
     if not (ROOT / environment / "bin" / "python").exists():
         pytest.skip(f"scripts/beside makes {environment}")
-    cases = CASES[::2] if name == "Newton" else CASES  # a step of Newton takes ten times as long
-    folders = [(export(tmp_path / str(k), player, *case), 1) for k, case in enumerate(cases)]
+    folders, own = list[tuple[Path, int]](), list[bool]()
+    for thing, hand, (k, mass) in itertools.product(map(load_object, OBJECTS), HANDS, enumerate(MASSES)):
+        grasps, place = planned(thing.name, hand)[k :: len(MASSES)], tmp_path / f"{thing.name}_{hand}_{k}"
+        save_play(load_hand(hand), grasps, place, player, thing.mesh, spec_of(mass), parts=thing.parts)
+        folders.append((place, len(grasps)))
+        own += own_verdicts(thing.name, hand, k)
     played = [x.held for x in play_all(environment, folders)]
-    assert played == [own_verdict(*case) for case in cases]
-    assert 0 < sum(played) < len(played)
+    assert len(own) >= 60 and sum(one == other for one, other in zip(played, own, strict=True)) >= LEAST_SAME * len(own)
+    assert 0.2 < sum(own) / len(own) < 0.9  # a scene in which nothing moves, or all is held, has other verdicts
 
 
 @pytest.mark.parametrize("player", LIBRARIES)
