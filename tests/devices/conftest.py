@@ -1,6 +1,7 @@
 """What the tests of devices share: the pretended device, and one planned object."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -23,6 +24,12 @@ def sent(value: Any) -> Any:
     if isinstance(value, Value | Tensor):
         return value.to(DEVICE)
     return type(value)(map(sent, value)) if isinstance(value, tuple | list) else value
+
+
+def at_home(function: Callable[[], Any]) -> Any:
+    """Return what a function computes on the CPU alone, as fast as without the pretended device."""
+    with torch._C.DisableTorchFunction():
+        return function()
 
 
 def tensors_of(value: Any) -> list[Tensor]:

@@ -29,6 +29,8 @@ INTO = {"__getitem__", "__setitem__", "index_put", "index_put_"}
 """Functions that take indices of the CPU, too."""
 COPIES = {"tolist", "__repr__", "__format__"}
 """Functions that copy a whole tensor to the host."""
+DEVICE_OF, IS_CUDA = Tensor.device.__get__, Tensor.is_cuda.__get__
+HOST_ONLY = Tensor.numpy, Tensor.__array__
 
 
 @dataclasses.dataclass
@@ -66,8 +68,9 @@ def elsewhere(value: Tensor) -> Tensor:
 
 def _home(value: Any) -> Any:
     """Return a device argument as the CPU's, if it names the pretended device."""
-    text = str(value) if isinstance(value, torch.device | str) else ""
-    return torch.device("cpu") if text.split(":")[0] == DEVICE.type else value
+    if not isinstance(value, torch.device | str):
+        return value
+    return torch.device("cpu") if str(value).split(":")[0] == DEVICE.type else value
 
 
 def _plain(value: Any) -> Any:
@@ -86,14 +89,17 @@ def _moved(value: Any) -> Any:
     return value
 
 
-def _tensors(value: Any) -> Iterator[Tensor]:
-    if isinstance(value, Tensor):
-        yield value
-    elif isinstance(value, list | tuple):
-        for part in value:
-            yield from _tensors(part)
-    elif isinstance(value, dict):
-        yield from _tensors(list(value.values()))
+def _tensors(values: Any) -> list[Tensor]:
+    """Return the tensors among values, and inside their lists, tuples and dictionaries."""
+    found = []
+    for value in values:
+        if isinstance(value, Tensor):
+            found.append(value)
+        elif isinstance(value, list | tuple):
+            found += _tensors(value)
+        elif isinstance(value, dict):
+            found += _tensors(value.values())
+    return found
 
 
 def _device(value: Tensor) -> torch.device:
@@ -116,20 +122,21 @@ class Elsewhere(Tensor):
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run a function of tensors as the device would."""
-        kwargs, name = dict(kwargs or {}), getattr(func, "__name__", "")
-        if func == Tensor.device.__get__:
+        if func == DEVICE_OF:
             return DEVICE
-        if func == Tensor.is_cuda.__get__:
+        if func == IS_CUDA:
             return True
+        kwargs, name = kwargs or {}, getattr(func, "__name__", "")
         with torch._C.DisableTorchFunctionSubclass():
             if func is Tensor.cpu:
                 TRAFFIC.tell("read")
                 return _plain(args[0]).clone()
             if func is Tensor.to:
                 return _to(args, kwargs)
-            if func in (Tensor.numpy, Tensor.__array__):
+            if func in HOST_ONLY:
                 raise TypeError(f"can't convert {DEVICE} device type tensor to numpy")
-            with _running():
+            TRAFFIC.running += 1
+            try:
                 if name == "__get__" or name == "__set__":
                     return _moved(func(*args, **kwargs))
                 if name in COPIES:
@@ -140,9 +147,9 @@ class Elsewhere(Tensor):
                     return elsewhere(args[0])
                 _refuse_mixes(func, name, args, kwargs)
                 _tell_uploads(name, args)
-                result = func(
-                    *(_home(_plain(x)) if not isinstance(x, list | tuple) else x for x in args), **_all_home(kwargs)
-                )
+                result = func(*map(_home, args), **_all_home(kwargs))
+            finally:
+                TRAFFIC.running -= 1
         stays = kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "cpu"
         return result if stays else _moved(result)
 
@@ -199,18 +206,17 @@ def _convert(target: torch.device, args: Any, kwargs: dict[str, Any]) -> Tensor:
 
 def _refuse_mixes(func: Any, name: str, args: Any, kwargs: dict[str, Any]) -> None:
     """Raise what a GPU raises for tensors of both devices, except where it takes them."""
-    tensors = list(_tensors([*args, kwargs]))
-    there = [x for x in tensors if isinstance(x, Elsewhere)]
-    here = [x for x in tensors if not isinstance(x, Elsewhere) and x.dim() > 0]
+    tensors = _tensors([*args, *kwargs.values()])
+    there = any(isinstance(x, Elsewhere) for x in tensors)
     generator = kwargs.get("generator")
     if generator is not None and there and generator.device.type == "cpu":
         raise RuntimeError(f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'")
-    if not there or not here:
+    if not there or not any(not isinstance(x, Elsewhere) and x.dim() > 0 for x in tensors):
         return
     if name == "copy_":
         return
     if name in INTO and isinstance(args[0], Elsewhere):
-        values = list(_tensors(args[2:3]))
+        values = _tensors(args[2:3])
         if any(not isinstance(x, Elsewhere) and x.dim() > 0 for x in values):
             raise RuntimeError(f"{name}: expected all tensors to be on the same device")
     else:
@@ -222,7 +228,9 @@ class _Makers(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run a function that makes or moves a tensor."""
-        kwargs = dict(kwargs or {})
+        kwargs = kwargs or {}
+        if func is not Tensor.to and func not in MAKERS:
+            return func(*args, **kwargs)
         if func in MAKERS and kwargs.get("device") is not None and torch.device(kwargs["device"]).type == DEVICE.type:
             if kwargs.get("generator") is not None:
                 raise RuntimeError(f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'")

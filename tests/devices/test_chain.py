@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.devices.conftest import same, sent
+from tests.devices.conftest import at_home, same, sent
 from tests.devices.elsewhere import DEVICE
-from tests.make import cup_view, see
+from tests.make import cup_view, load_hand, see
 from tests.pinch import QUICK, cylinder, pinch
 from tests.planner.test_many import share_found
 from torchgrasp import (
@@ -20,7 +20,6 @@ from torchgrasp import (
     explain_empty,
     explain_success,
     fit_shape,
-    load_hand,
     load_object,
     load_scene,
     plan_contacts,
@@ -81,12 +80,12 @@ TEXTS = {
 @pytest.mark.promise("F8")
 @pytest.mark.parametrize("name", PLANS)
 def test_grasps_of_every_kind_are_where_the_cloud_is(device, hand, name):
-    same(PLANS[name](sent(VIEW), hand), PLANS[name](VIEW, hand))
+    same(PLANS[name](sent(VIEW), hand), at_home(lambda: PLANS[name](VIEW, hand)))
 
 
 def test_clouds_planned_together_have_the_grasps_of_each_alone(device, hand):
     clouds, task = [VIEW, PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint), cup_view(0.004)], GraspTask(0.1)
-    alone = plan_grasps(clouds, hand, SPEC, 6, task=task)
+    alone = at_home(lambda: plan_grasps(clouds, hand, SPEC, 6, task=task))
     together = plan_grasps(sent(clouds), hand, SPEC, 6, task=task)
     assert "refused" in together[1].meta and all(grasps.joints.device == DEVICE for grasps in together)
     for there, here in zip(together[::2], alone[::2], strict=True):
@@ -98,7 +97,7 @@ def test_workers_estimate_shapes_for_plans_where_the_clouds_are(device, hand, mo
     """The workers are played by this process, which alone knows the pretended device."""
     serial = lambda function, tasks, workers, limit: (function(*task) for task in tasks)  # noqa: E731
     monkeypatch.setattr("torchgrasp.planner.many.run_tasks", serial)
-    expected = plan_grasps([VIEW], hand, SPEC, 2)
+    expected = at_home(lambda: plan_grasps([VIEW], hand, SPEC, 2))
     same(plan_grasps([sent(VIEW)], hand, SPEC, 2, workers=1), expected)
     refused = plan_grasps([sent(PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint))], hand, SPEC, 2)[0]
     assert "refused" in refused.meta and refused.joints.device == DEVICE
@@ -106,7 +105,8 @@ def test_workers_estimate_shapes_for_plans_where_the_clouds_are(device, hand, mo
 
 def test_the_reason_for_no_grasp_is_the_same(device, hand):
     uncertain = ContactSpec(table=0.0, max_variance=1e-6)
-    assert str(explain_empty(sent(VIEW), hand, uncertain, 1)) == str(explain_empty(VIEW, hand, uncertain, 1))
+    here = at_home(lambda: explain_empty(VIEW, hand, uncertain, 1))
+    assert str(explain_empty(sent(VIEW), hand, uncertain, 1)) == str(here)
 
 
 def test_things_of_a_scene_are_planned_where_it_is(device, hand):
