@@ -7,7 +7,6 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import torch
-from benchmarks.load.swarm import begin
 
 from torchgrasp.campaign.folder import Campaign
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard
@@ -86,12 +85,16 @@ def die_at(number: int, row: JobRow, meta: dict[str, str], deadly: int) -> bytes
 
 def seen_job(number: int, row: JobRow, meta: dict[str, str], plans: list[int] | None = None) -> bytes:
     """Do a job on a worker in this process; with plans, it is the job that has the number's plan."""
+    from benchmarks.load.swarm import begin  # not at the top: other workers need no Dask
+
     begin(number)
     return cheap_job(number if plans is None else plans[number % len(plans)], row, meta)
 
 
 def seen_plan(numbers: list[int]) -> list[int]:
     """Return the numbers of jobs as their plans."""
+    from benchmarks.load.swarm import begin
+
     begin(-1 - numbers[0])
     return numbers
 

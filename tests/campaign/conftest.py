@@ -10,8 +10,8 @@ from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.data import write_objects
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec
 
-LIFT = PROTOCOLS["tabletop"].with_trial(hold_time=0.1)
-QUICK = CampaignSpec(LIFT, EvaluationSpec(2, "spread", starts=40))
+LIFT = PROTOCOLS["tabletop"].with_trial(hold_time=0.1, control_rate=50.0)
+QUICK = CampaignSpec(LIFT, EvaluationSpec(2, "spread", starts=16))
 
 
 @pytest.fixture(scope="session")
