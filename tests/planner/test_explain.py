@@ -224,7 +224,7 @@ def test_a_thing_that_no_hand_holds_is_explained_with_few_plans_and_twice_alike(
     monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 1)
     plans, heard, run = [], [], Planner.run
     monkeypatch.setattr(Planner, "run", lambda self, *given: plans.append(self.stack) or run(self, *given))
-    cloud, hand = ball(radius=0.2, centre=(0.0, 0.0, 0.2)), load_hand("barrett")
+    cloud, hand = ball(radius=0.14, centre=(0.0, 0.0, 0.14)), load_hand("barrett")
     own = PostureLibrary.of(hand)
     note = lambda stage, text, _: heard.append((stage, text, len(plans)))  # noqa: E731
     first, again = (explain_empty(cloud, hand, TABLE, starts=100, observer=note) for _ in range(2))
