@@ -10,6 +10,7 @@ import trimesh
 
 from tests.pinch import QUICK, close, cylinder, pinch, quick_trial
 from torchgrasp import Status, close_hand
+from torchgrasp.closure import ClosingOptions
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, Truth, pull_grasp
 from torchgrasp.evaluation.trial import TrialDriver, TrialRun
 from torchgrasp.sim import SceneSpec, open_scene
@@ -18,6 +19,7 @@ from torchgrasp.values import Contacts
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 PULL = PROTOCOLS["dexgraspbench"].with_trial(mass=0.05)
+ONCE = ClosingOptions(attempts=1)
 PULL = dataclasses.replace(PULL, pull=dataclasses.replace(PULL.pull, seconds=0.2))
 
 
@@ -82,7 +84,7 @@ def pulled(run: TrialRun) -> np.ndarray:
 def test_simulators_report_drives_that_are_too_weak(simulator):
     hand, grasp = pinch("allegro")
     drives = {name: drive._replace(effort=0.01) for name, drive in hand.actuators.items()}
-    spec = dataclasses.replace(QUICK, simulator=simulator)
+    spec = dataclasses.replace(QUICK, simulator=simulator, options=ONCE)
     result = close_hand(grasp, dataclasses.replace(hand, actuators=drives), cylinder(), spec)
     assert result.status is Status.TOO_WEAK and quick_trial("allegro", simulator).status is Status.OK
 
@@ -93,11 +95,13 @@ def test_simulators_never_hold_a_diverged_or_overlapping_trial(simulator, tmp_pa
     hand, grasp = pinch("allegro")
     drives = {name: drive._replace(kp=1e12, kd=0.0, effort=1e30) for name, drive in hand.actuators.items()}
     wild, protocol = dataclasses.replace(hand, actuators=drives), PULL.with_trial(simulator=simulator)
-    for closing in ("open_loop", "uncertainty"):
-        spec = dataclasses.replace(QUICK, simulator=simulator, closing=closing)
+    for closing, options in (("open_loop", None), ("uncertainty", ONCE)):
+        spec = dataclasses.replace(QUICK, simulator=simulator, closing=closing, options=options)
         found = close_hand(grasp, wild, cylinder(), spec)
         assert not found.held or float(found.forces.max()) < 50.0  # PhysX's drives are stable at any stiffness
-        result = pull_grasp(GraspTrial(wild, grasp, Truth(cylinder())), protocol.with_trial(closing=closing, kp=None))
+        result = pull_grasp(
+            GraspTrial(wild, grasp, Truth(cylinder())), protocol.with_trial(closing=closing, options=options, kp=None)
+        )
         assert result.status in (Status.UNSTABLE, Status.MOVED) or (result.passed and result.force < 50.0)
     deep = GraspTrial(hand, grasp, Truth(cylinder((0.04, 0.04))))
     assert pull_grasp(deep, protocol).status is Status.START_OVERLAP
