@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import pytest
 
-from torchgrasp import ContactSpec, Grasps, ShapeGP, Status, certify, fit_shape, load_hand, load_object, plan_contacts
+from tests.make import load_hand
+from torchgrasp import ContactSpec, Grasps, ShapeGP, Status, certify, fit_shape, load_object, plan_contacts
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik import CollisionWorld, GraspProblem, PostureLibrary, nearest_postures, solve_joint
 from torchgrasp.shape.surface import Surface, extract_surface

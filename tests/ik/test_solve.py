@@ -38,9 +38,9 @@ def test_contacts_of_four_fingers_are_solved_in_any_order():
 
 @pytest.fixture(scope="module", params=["allegro", "barrett"])
 def scene(request):
-    """A hand, its model, its own postures, and contacts that 16 postures of another seed touch."""
+    """A hand, its model, its own postures, and contacts that 10 postures of another seed touch."""
     hand = load_hand(request.param)
-    contacts = touched_contacts(hand, sample_configurations(hand, 16, seed=5).joints)
+    contacts = touched_contacts(hand, sample_configurations(hand, 10, seed=5).joints)
     return hand, load_mixture(request.param), PostureLibrary.of(hand), contacts
 
 

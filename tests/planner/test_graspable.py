@@ -143,6 +143,9 @@ def test_what_no_trial_supports_has_a_status_or_an_unknown_success_and_comes_las
     scene = BEYOND[name]()
     assert order_by_ease(scene) == [2, 1]
     assert judge_things(scene, HAND)[1] is not Status.OK or is_unknown(scene)
+
+
+def test_the_success_of_a_good_grasp_of_a_whole_box_is_known():
     assert not is_unknown(see(BOX))
 
 

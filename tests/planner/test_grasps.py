@@ -1,5 +1,7 @@
 """The whole chain on a shipped view: every returned grasp is judged again, by code of its own."""
 
+import functools
+
 import pytest
 import torch
 
@@ -8,6 +10,7 @@ from torchgrasp import (
     ContactPlan,
     Contacts,
     ContactSpec,
+    Grasps,
     GraspTask,
     PointCloud,
     Status,
@@ -32,6 +35,12 @@ from torchgrasp.success.promise import Promise
 
 SPEC = ContactSpec(table=0.0)
 VIEW = load_object("cylinder").view
+
+
+@functools.cache
+def usual() -> Grasps:
+    """The grasps of the view without a task or a promise."""
+    return plan_grasps(VIEW, load_hand("barrett"), SPEC, starts=12)
 
 
 @pytest.mark.promise("N1")
@@ -78,25 +87,24 @@ def test_success_is_what_the_model_says_of_the_features_that_an_explanation_meas
 def test_a_task_changes_the_predictions_and_not_the_grasps(task):
     hand, shapes = load_hand("barrett"), []
     note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731
-    usual = plan_grasps(VIEW, hand, SPEC, starts=12)
     grasps = plan_grasps(VIEW, hand, SPEC, starts=12, task=task, observer=note)
     best = grasps[grasps.status == Status.OK]
     odds = load_model().log_odds(measure_again(best, hand, shapes[0], task))
     near(best.score, odds, 1e-6)
-    assert grasps.meta["task"] == task.describe() != usual.meta["task"]
-    first, second = (set(map(tuple, found[found.status == Status.OK].joints.tolist())) for found in (usual, grasps))
+    assert grasps.meta["task"] == task.describe() != usual().meta["task"]
+    first, second = (set(map(tuple, found[found.status == Status.OK].joints.tolist())) for found in (usual(), grasps))
     assert first <= second or second <= first  # further constraints are tried where no grasp is likely to hold
 
 
 def test_a_promise_refuses_the_less_likely_grasps_of_the_same_plan(monkeypatch):
     hand = load_hand("barrett")
-    usual = plan_grasps(VIEW, hand, SPEC, starts=12)
-    bound = float(usual.score[usual.status == Status.OK].median())
+    expected = usual().score
+    bound = float(expected[usual().status == Status.OK].median())
     monkeypatch.setattr("torchgrasp.success.order.find_promise", lambda share: Promise(bound, 400, 100))
     kept = plan_grasps(VIEW, hand, SPEC, starts=12, promise=0.9)
     sure, refused = (kept[kept.status == status] for status in (Status.OK, Status.NO_PROMISE))
     assert len(sure) and len(refused) and bool((sure.score >= bound).all()) and bool((refused.score < bound).all())
-    assert torch.equal(kept.score[: len(sure) + len(refused)], usual.score[: len(sure) + len(refused)])
+    assert torch.equal(kept.score[: len(sure) + len(refused)], expected[: len(sure) + len(refused)])
     assert not bool(refused.success.any()) and kept.meta["promise"].startswith("0.9")
     monkeypatch.setattr("torchgrasp.success.order.find_promise", lambda share: None)
     none = plan_grasps(VIEW, hand, SPEC, starts=12, promise=0.9)

@@ -31,7 +31,7 @@ REFUSED = re.compile(r"torchgrasp: --(out|checkpoint|parquet): .*(No space left|
 HELD = {"sample": "samples", "grasp": "grasps", "evaluate": "evaluation", "campaign": "campaign"}
 """The folder that each command holds."""
 
-STEP = 8
+STEP = 12
 """Every so many-th call is tried, from another first one in each test."""
 
 
@@ -47,7 +47,7 @@ class Bench(NamedTuple):
     def disturb(self, first: int, *happenings: Happening) -> Iterator[tuple[Ended, Path]]:
         """Let something happen at many calls, each in a fresh folder; then the command is run again to its end."""
         for at in range(first % self.step, len(self.calls), self.step):
-            out = self.folder / str(at)
+            out = self.folder / f"{first}-{at}"
             yield run(self.command(out), happenings[at // self.step % len(happenings)], at), out
             again = run(self.command(out))
             assert (again.code, again.said) == (0, ""), (at, self.calls[at], again.said)
@@ -65,18 +65,20 @@ class Bench(NamedTuple):
         return all(data == self.whole[name] or name.startswith("step") for name, data in found.items())
 
 
-@pytest.fixture(params=COMMANDS)
-def bench(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    command = COMMANDS[request.param](monkeypatch, tmp_path)
-    with contextlib.redirect_stdout(io.StringIO()):
-        assert cli.main(command(tmp_path / "first")) == 0  # imports what the children would import each
-    ended = run(command(tmp_path / "whole"))
-    whole = contents(tmp_path / "whole")
-    assert (ended.code, ended.said) == (0, "")
-    assert {"open", "write", "fsync", "replace", "unlink"} <= set(ended.calls) and len(whole) > 1
-    assert not any(Path(name).name.startswith(".") for name in whole)
-    long = request.config.getoption("--hypothesis-profile") == "long"
-    return Bench(command, whole, ended.calls, tmp_path, 1 if long else STEP)
+@pytest.fixture(scope="module", params=COMMANDS)
+def bench(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    folder = tmp_path_factory.mktemp(request.param)
+    with pytest.MonkeyPatch.context() as patch:
+        command = COMMANDS[request.param](patch, folder)
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert cli.main(command(folder / "first")) == 0  # imports what the children would import each
+        ended = run(command(folder / "whole"))
+        whole = contents(folder / "whole")
+        assert (ended.code, ended.said) == (0, "")
+        assert {"open", "write", "fsync", "replace", "unlink"} <= set(ended.calls) and len(whole) > 1
+        assert not any(Path(name).name.startswith(".") for name in whole)
+        long = request.config.getoption("--hypothesis-profile") == "long"
+        yield Bench(command, whole, ended.calls, folder, 1 if long else STEP)
 
 
 @pytest.mark.promise("F1")
