@@ -126,20 +126,20 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
 
 
 def maximise(
-    objective: Float[Tensor, "b 6"], bounds: Float[Tensor, "b m 6"]
-) -> tuple[Float[Tensor, "b 6"], Int[Tensor, "b 6"], Float[Tensor, "b 6"]]:
+    objective: Float[Tensor, "b d"], bounds: Float[Tensor, "b m d"]
+) -> tuple[Float[Tensor, "b d"], Int[Tensor, "b d"], Float[Tensor, "b d"]]:
     """Maximise a.v with c_k.v <= 1 for all k, for objectives a and m bounds c of each row, by the simplex method.
 
-    Return the best v, or a direction in which a.v grows for ever; the six tight bounds; and their multipliers. All
+    Return the best v, or a direction in which a.v grows for ever; the d tight bounds; and their multipliers. All
     programmes run at once, until all are optimal. The point v = 0 is feasible, so there is no first phase.
     """
-    b, m, _ = bounds.shape
+    b, m, d = bounds.shape
     row = torch.arange(b, device=bounds.device)
-    # The first six tight rows are artificial, v = 0 itself: they leave first, in either direction.
-    tight = bounds.new_full((b, 6), -1).long()
-    inverse = torch.eye(6, dtype=bounds.dtype, device=bounds.device).repeat(b, 1, 1)
+    # The first tight rows are artificial, v = 0 itself: they leave first, in either direction.
+    tight = bounds.new_full((b, d), -1).long()
+    inverse = torch.eye(d, dtype=bounds.dtype, device=bounds.device).repeat(b, 1, 1)
     slack = bounds.new_ones(b, m)
-    ray = bounds.new_zeros(b, 6)
+    ray = bounds.new_zeros(b, d)
     running = torch.ones_like(row, dtype=torch.bool)
     every = 1 if bounds.device.type == "cpu" else 16  # pivots between two looks at whether any programme goes on
     for k in range(PIVOTS):
@@ -173,8 +173,8 @@ def maximise(
     # From the tight rows alone, so that the roundings of the pivots are gone.
     artificial = tight < 0
     index = tight.clamp(min=0)
-    identity = torch.eye(6, dtype=bounds.dtype, device=bounds.device)
-    basis = torch.where(artificial[:, :, None], identity, bounds.gather(1, index[:, :, None].expand(b, 6, 6)))
+    identity = torch.eye(d, dtype=bounds.dtype, device=bounds.device)
+    basis = torch.where(artificial[:, :, None], identity, bounds.gather(1, index[:, :, None].expand(b, d, d)))
     vertex, _ = torch.linalg.solve_ex(basis, (~artificial).to(bounds))
     multiplier, _ = torch.linalg.solve_ex(basis.mT, objective)
     multiplier = torch.where(artificial, 0.0, multiplier)

@@ -5,8 +5,8 @@ forces; -t is the wrench that balances the load t. The greatest s with -s t in K
 
     sum_i b_i max(0, max_k y.w_ik)    among the twists y with y.t = -1,
 
-so each such y proves that s is no greater. K has too many corners to list, (e + 1)^f. The simplex method maximises -t.y
-with p.y <= 1 for some corners p of K; while a corner breaks its bound, the corner that breaks it most joins them.
+so each such y proves that s is no greater. The simplex method maximises -t.y, whose greatest value is 1/s, with
+z_i >= b_i y.w_ik, z_i >= 0 and sum_i z_i <= 1. It begins at y = 0, z_i = 1/(2f).
 """
 
 from typing import NamedTuple
@@ -53,26 +53,13 @@ def resist_loads(
 
 def _solve(edge: Float[Tensor, "r f e 6"], goal: Float[Tensor, "r 6"]) -> tuple[Tensor, Tensor, Tensor]:
     """Return the greatest multiple of each wrench `goal` that forces along the edges make, with twist and forces."""
-    _, f, e, _ = edge.shape
-    margin, twist, forces = goal.new_zeros(len(goal)), torch.zeros_like(goal), goal.new_zeros(len(goal), f, 3)
-    single = torch.arange(f * (e - 1), device=goal.device)
-    choice = torch.full((len(single), f), e - 1, device=goal.device)  # the edge along which each contact pushes
-    choice[single, single // (e - 1)] = single % (e - 1)
-    choice, left = choice.expand(len(goal), -1, -1), torch.arange(len(goal), device=goal.device)
-    for _ in range(60):  # far more rounds than five contacts need
-        own = edge[left]
-        corner = own.gather(2, choice.mT[..., None].expand(-1, -1, -1, 6))
-        y, tight, weight = maximise(goal[left], corner.sum(1))
-        part = corner.gather(2, tight[:, None, :, None].expand(-1, f, -1, 6))
-        made, gauge = (weight[:, None, :, None] * part).sum(2), weight.sum(1)
-        exact = ((made.sum(1) - goal[left]).abs().amax(1) <= BALANCED) & (weight.amin(1) >= -BALANCED) & (gauge > 0)
-        push, best = (own @ y[:, None, :, None])[..., 0].max(2)
-        along = (goal[left] * y).sum(1)
-        lower = torch.where(exact, 1 / gauge, 0.0)
-        margin[left], twist[left] = lower, y / along[:, None]
-        forces[left] = made[..., :3] * lower[:, None, None]
-        broken = torch.nonzero(push.sum(1) / along - lower > BALANCED * (1 + lower))[:, 0]
-        if not len(broken):
-            break
-        left, choice = left[broken], torch.cat([choice[broken], best[broken, None]], 1)
-    return margin, twist, forces
+    r, f, e, _ = edge.shape
+    own = torch.eye(f).to(edge)  # the unknowns are y and u_i = 2f z_i - 1
+    above = torch.cat([2 * f * edge, -own[:, None].expand(r, f, e, f)], -1).flatten(1, 2)
+    total = torch.cat([edge.new_zeros(6), edge.new_full((f,), 1 / f)]).expand(r, 1, -1)
+    found, tight, weight = maximise(torch.cat([goal, goal.new_zeros(r, f)], 1), torch.cat([above, total], 1))
+    share = goal.new_zeros(r, f * e + 1).scatter_add(1, tight, weight)[:, :-1].view(r, f, e, 1)
+    made, gauge, y = (2 * f * share * edge).sum(2), weight.sum(1), found[:, :6]
+    exact = ((made.sum(1) - goal).abs().amax(1) <= BALANCED) & (weight.amin(1) >= -BALANCED) & (gauge > 0)
+    margin = torch.where(exact, 1 / gauge, 0.0)
+    return margin, y / (goal * y).sum(1, keepdim=True), made[..., :3] * margin[:, None, None]
