@@ -15,7 +15,7 @@ from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.errors import BadArgument
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.plan.certify import certify
-from torchgrasp.planner.contacts import LIKELY, Pool, SeededContacts
+from torchgrasp.planner.contacts import LIKELY, WEAK, Pool, SeededContacts
 from torchgrasp.planner.schedule import FIRST, schedule
 from torchgrasp.values import Certificate, Contacts, IKSeeds
 
@@ -157,7 +157,8 @@ def offer(points, seeds_of):
     seeds = IKSeeds(torch.zeros(g, 4).double(), pose, row, torch.arange(3).repeat(g, 1), energy, torch.zeros(g, 3))
     certificate = Certificate(nan, nan, nan, torch.ones(n, dtype=torch.bool), torch.zeros(n, 6).double())
     contacts, seeds = Contacts(points, torch.zeros_like(points)), dataclasses.replace(seeds, row=row)
-    return SeededContacts(contacts, certificate, seeds, torch.zeros(len(points), dtype=torch.int64))
+    owner, load = torch.zeros(n, dtype=torch.int64), torch.zeros(n, 6).double()
+    return SeededContacts(contacts, certificate, seeds, owner, load)
 
 
 def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
@@ -184,11 +185,24 @@ def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
     assert len(untried.take(5).contacts) == 0
 
 
+def test_sets_that_do_not_resist_the_task_are_taken_only_where_others_lack():
+    points = torch.rand(30, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    cost = torch.arange(30).double() + WEAK * (torch.arange(30) % 3 > 0)  # each third set resists
+    for most in (6, 9, 14):
+        pool = Pool(1)
+        pool.add(offer(points, [[float(i)] for i in range(30)]), cost)
+        taken = {int(i) for i in pool.take(most).seeds.energy}
+        strong = {i for i in taken if i % 3 == 0}
+        assert len(taken) == most and len(strong) == min(most, 10)
+        assert taken - strong == set(sorted(set(range(30)) - set(range(0, 30, 3)))[: most - len(strong)])
+
+
 def test_the_contact_sets_of_several_clouds_are_chosen_at_once_as_those_of_each_alone():
     rng, clouds = torch.Generator().manual_seed(4), 3
     points = torch.rand(40, 3, 3, generator=rng, dtype=torch.float64)
     cost = torch.rand(40, generator=rng, dtype=torch.float64)
     cost[7], owner = torch.inf, torch.randint(clouds - 1, (40,), generator=rng) * 2  # the cloud in the middle has none
+    cost[10:34] += WEAK
     together, alone = Pool(clouds), [Pool(1) for _ in range(clouds)]
     together.add(offer(points[:0], []), cost[:0])
     assert len(together.take(4).contacts) == 0

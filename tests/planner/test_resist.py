@@ -13,8 +13,12 @@ from torchgrasp.errors import BadArgument
 from torchgrasp.export import format_grasps
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import Plane, move
+from torchgrasp.ik.attempts import assign
+from torchgrasp.planner.contacts import contact_costs, find_contacts
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
+from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.request import Request
+from torchgrasp.planner.stack import Stack
 from torchgrasp.success import TaskWrenches
 from torchgrasp.success.task import loads_of
 
@@ -106,4 +110,52 @@ def test_a_load_that_is_too_great_is_named_and_given_up():
     heavy = TaskWrenches(real([[0.0, 0.0, -500.0, 0.0, 0.0, 0.0]]))
     told = explain_empty(VIEW, HAND, ContactSpec(table=0.0), 20, resist=heavy)
     assert told.best is not None and told.best.words == "without resist"
-    assert Status.NOT_RESISTED in told.funnel.stages[-1].lost
+    assert told.funnel.reason is Status.NOT_RESISTED and told.funnel.stages[0].lost[Status.NOT_RESISTED] > 0
+
+
+def could_resist(stack, contacts, owner, strength) -> list[bool]:
+    """Whether contacts of these strengths [N] resist all loads of their cloud, by HiGHS."""
+    found = list[bool]()
+    for p, n, own, most in zip(contacts.points, contacts.normals, owner.tolist(), strength, strict=True):
+        loads = stack.problems[own].loads.numpy()
+        found.append(all(by_highs(p, n, most.numpy(), load) >= 1 for load in loads))
+    return found
+
+
+@pytest.fixture(scope="module")
+def steered():
+    """The plan of two clouds that must resist pushes, with the contact sets that the hand may try."""
+    views = [VIEW, load_object("cylinder").view]
+    stack = Stack.of([Problem.of(Request(x, HAND, ContactSpec(table=0.0), 40, resist="push"), HAND) for x in views])
+    plan, owner = next(stack.plans())
+    told = {}
+    found = find_contacts(stack, plan, owner, 1000, lambda stage, value, **_: told.update({stage: value}))
+    return stack, (plan, owner), told["plan"], found
+
+
+def test_the_hand_tries_the_contact_sets_that_resist_with_the_greatest_forces_and_the_plan_says_so_of_others(steered):
+    stack, (plan, owner), told, found = steered
+    rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+    strength = torch.full((len(rows), 3), 15.0)  # the greatest force of a finger
+    resisting = torch.tensor(could_resist(stack, plan.contacts[rows], owner[rows], strength))
+    assert 10 < int(resisting.sum()) < len(rows) - 10
+    assert torch.equal(told.status[rows] == Status.OK, resisting)
+    assert bool((told.status[rows[~resisting]] == Status.NOT_RESISTED).all())
+    assert torch.equal(found.contacts.points, plan.contacts.points[rows[resisting]])
+
+
+def test_contact_sets_and_postures_that_resist_the_worst_load_come_first(steered):
+    found, cost = contact_costs(steered[0], steered[-1])
+    seeds, contacts = found.seeds, assign(found.contacts, found.seeds)
+    hand_from_obj = inverse(seeds.obj_from_hand)
+    jacobian = HAND.jacobian(seeds.joints, apply(hand_from_obj, contacts.points))
+    torque = torch.einsum("gfih,gfi->gfh", jacobian, rotate(hand_from_obj, contacts.normals)).abs()
+    strength = (real([HAND.actuators[name].effort for name in HAND.joint_names]) / torque).amin(-1).clamp(max=15)
+    points, loads = contacts.points - contacts.points.mean(1, keepdim=True), found.load[seeds.row]
+    rows = zip(points, contacts.normals, strength.numpy(), loads.numpy(), strict=True)
+    margins = real([by_highs(*row) for row in rows]).clamp(max=1)
+    of_sets = [margins[seeds.row == row] for row in range(len(cost))]
+    assert all(bool((margin.diff() < 1e-9).all()) for margin in of_sets)
+    good = torch.stack([margin[0] == 1 for margin in of_sets])
+    assert 0 < int(good.sum()) < len(good)
+    assert float(cost[good].max()) < float(cost[~good].min())

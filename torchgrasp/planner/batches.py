@@ -23,7 +23,7 @@ from torchgrasp.planner.report import Report
 from torchgrasp.planner.schedule import OFFERED
 from torchgrasp.planner.stack import Owner, Stack, by_cloud
 from torchgrasp.specs import Ranking
-from torchgrasp.success.features import GRIP, measure_grasps
+from torchgrasp.success.features import measure_grasps
 from torchgrasp.success.loads import strength_of
 from torchgrasp.success.model import load_model
 from torchgrasp.success.order import by_success, grade, is_known, keep_promise, rank_by_variance
@@ -143,7 +143,7 @@ class Planner:
         """Return grasps on the most promising contact sets so far, and on sets that earlier batches left unsolved."""
         if plan is not None:
             found = find_contacts(self.stack, *plan, OFFERED * tried, report.note)
-            self.pool.add(found, contact_costs(self.stack, found))
+            self.pool.add(*contact_costs(self.stack, found))
         found, done = self.pool.take(tried), list[Owned]()
         first, self.first = self.first, False
         if first and not last:
@@ -242,13 +242,10 @@ def rank(stack: Stack, solved: Owned) -> list[Grasps]:
 
 def prove_resistance(stack: Stack, solved: Owned) -> Grasps:
     """Return grasps with the loads that they resist; of executable ones, those that resist less than all fail."""
-    loads, grasps = [problem.loads for problem in stack.problems], solved.grasps
-    if loads[0] is None:
+    grasps, contacts = solved.grasps, solved.grasps.contacts
+    if stack.loads is None:
         return grasps
-    task, hand, contacts = stack.first.request.grasp_task, stack.hand, grasps.contacts
-    force = task.pressing(task.lifts(stack.first.spec.plane)) or GRIP
-    strength = strength_of(hand, grasps, force).to(contacts.points)
-    own = torch.stack([x for x in loads if x is not None]).to(contacts.points)[solved.owner]
+    strength, own = strength_of(stack.hand, grasps, contacts, stack.strongest), stack.loads[solved.owner]
     proof = resist_loads(contacts.points, contacts.normals, strength, own, stack.first.spec)
     fields = dict(zip(("task_margin", "task_load", "task_twist", "task_forces"), proof, strict=True))
     weak = (grasps.status == Status.OK) & ~(proof.margin >= 1)

@@ -8,29 +8,35 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import join, rank_in_group
+from torchgrasp.base import join, lexical_order, rank_in_group
 from torchgrasp.checks import Count, checked
 from torchgrasp.errors import Status
 from torchgrasp.geometry.linalg import farthest_points
-from torchgrasp.ik.attempts import seed_costs
+from torchgrasp.ik.attempts import assign, seed_costs
 from torchgrasp.ik.seeds import nearest_postures, query_mixture
 from torchgrasp.plan.certify import certify
+from torchgrasp.plan.resist import resist_loads
 from torchgrasp.planner.stack import Owner, Stack, by_cloud
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
-from torchgrasp.success.loads import load_arm
+from torchgrasp.success.loads import load_arm, strength_of
 from torchgrasp.values import Certificate, ContactPlan, Contacts, IKSeeds
 
 LIKELY = 2
 """Farthest-point sampling takes n contact sets from the `LIKELY` * n sets with the lowest cost."""
+WEAK = 1e6  # cost of contact sets that resist less than the task's loads: above all other costs
 
 
 class SeededContacts(NamedTuple):
-    """Contact sets with force closure, their certificates, initial hand postures (seeds), and clouds."""
+    """Contact sets with force closure, their certificates, initial hand postures (seeds), and clouds.
+
+    `load` is the wrench [N, N m] of the task, about the centroid, of which the greatest forces resist the least.
+    """
 
     contacts: Contacts
     certificate: Certificate
     seeds: IKSeeds
     owner: Owner
+    load: Float[Tensor, "b 6"]
 
     def select(self, rows: Int[Tensor, "k"]) -> "SeededContacts":
         """Return the contact sets with given indices, with their certificates and initial hand postures (seeds)."""
@@ -38,7 +44,8 @@ class SeededContacts(NamedTuple):
         number[rows] = torch.arange(len(rows), device=rows.device)
         seeds = self.seeds[number[self.seeds.row] >= 0]
         seeds = dataclasses.replace(seeds, row=number[seeds.row])
-        return SeededContacts(self.contacts[rows], self.certificate[rows], seeds, self.owner[rows])
+        contacts, certificate = self.contacts[rows], self.certificate[rows]
+        return SeededContacts(contacts, certificate, seeds, self.owner[rows], self.load[rows])
 
 
 def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
@@ -48,7 +55,8 @@ def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
         seeds.append(dataclasses.replace(part.seeds, row=part.seeds.row + first))
         first += len(part.contacts)
     contacts, certificate = join([x.contacts for x in parts]), join([x.certificate for x in parts])
-    return SeededContacts(contacts, certificate, join(seeds), torch.cat([x.owner for x in parts]))
+    owner, load = (torch.cat([x[k] for x in parts]) for k in (3, 4))
+    return SeededContacts(contacts, certificate, join(seeds), owner, load)
 
 
 def find_contacts(
@@ -57,9 +65,17 @@ def find_contacts(
     """Choose at most `most` planned contact sets of each cloud, far apart; return the closed ones, and hand postures.
 
     In mode "paper" with ranking "variance" all sets are chosen, the most certain first. `note` is called with the
-    results of the stages "plan", "certify" and "query".
+    results of the stages "plan", "certify" and "query". Sets that not even the greatest forces could hold have failed.
     """
     request = stack.first.request
+    load = plan.contacts.points.new_zeros(len(plan), 6)
+    if stack.loads is not None:
+        rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+        points, normals = plan.contacts.points[rows], plan.contacts.normals[rows]
+        full = torch.full_like(points[..., 0], stack.strongest)
+        proof = resist_loads(points, normals, full, stack.loads[owner[rows]], stack.first.spec)
+        status = plan.status.index_fill(0, rows[~(proof.margin >= 1)], int(Status.NOT_RESISTED))
+        plan, load[rows] = dataclasses.replace(plan, status=status), proof.load
     note("plan", plan)
     if request.mode == "paper" and request.order == "variance":
         rows, variance = torch.nonzero(plan.status == Status.OK)[:, 0], plan.contacts.variance
@@ -69,11 +85,12 @@ def find_contacts(
         rows = _spread(stack, plan, owner, most)
     certificate = certify(plan.contacts[rows], stack.first.spec)
     closed = torch.nonzero(certificate.closed)[:, 0]
-    contacts, certificate, owner = plan.contacts[rows[closed]], certificate[closed], owner[rows[closed]]
+    certificate, kept = certificate[closed], rows[closed]
+    contacts, owner = plan.contacts[kept], owner[kept]
     note("certify", certificate, offered=len(rows))
     seeds = find_seeds(stack, contacts, owner)
     note("query", seeds)
-    return SeededContacts(contacts, certificate, seeds, owner)
+    return SeededContacts(contacts, certificate, seeds, owner, load[kept])
 
 
 def _spread(stack: Stack, plan: ContactPlan, owner: Owner, most: int) -> Int[Tensor, "k"]:
@@ -129,7 +146,8 @@ class Pool:
         if self.clouds > 1:
             rows = _choose_of_each(points, cost, owner, before, most, self.clouds)
         else:
-            likely = torch.argsort(cost, stable=True)[: min(LIKELY * most, int(torch.isfinite(cost).sum()))]
+            likely = torch.argsort(cost, stable=True)[: LIKELY * most]
+            likely = likely[_are_likely(cost[likely], most)]
             rows = likely[farthest_points(points[likely], most, before=points[before])].sort().values
         self.taken.append(rows)
         return found.select(rows)
@@ -146,7 +164,7 @@ def _choose_of_each(
         return owner
     table, held = _table(owner, clouds)
     least, order = torch.where(held, cost[table], torch.inf).sort(dim=1, stable=True)
-    rows, likely = table.gather(1, order)[:, : LIKELY * most], torch.isfinite(least[:, : LIKELY * most])
+    rows, likely = table.gather(1, order)[:, : LIKELY * most], _are_likely(least[:, : LIKELY * most], most)
     x = points[rows]
     nearest = torch.full_like(likely, torch.inf, dtype=x.dtype)
     if len(before):
@@ -164,6 +182,11 @@ def _choose_of_each(
     return chosen[torch.nonzero(chosen < len(owner))[:, 0]]
 
 
+def _are_likely(cost: Float[Tensor, "*c m"], most: int) -> Bool[Tensor, "*c m"]:
+    """Return for sorted costs a mask of sets to choose from: beyond the first `most` only those that resist loads."""
+    return torch.isfinite(cost) & ((cost < WEAK) | (torch.arange(cost.shape[-1], device=cost.device) < most))
+
+
 def _table(owner: Owner, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, "c m"]]:
     """Return the indices of the rows of each cloud, in their order, and a mask of the places that hold one."""
     count = torch.bincount(owner, minlength=clouds)
@@ -172,15 +195,28 @@ def _table(owner: Owner, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, 
     return table, torch.arange(table.shape[1], device=owner.device) < count[:, None]
 
 
-def contact_costs(stack: Stack, found: SeededContacts) -> Float[Tensor, "b"]:
-    """Return one cost per contact set: large if its first two hand postures miss it, or the load has a long arm."""
-    contacts, certificate, seeds, owner = found
+def contact_costs(stack: Stack, found: SeededContacts) -> tuple[SeededContacts, Float[Tensor, "b"]]:
+    """Return one cost per contact set: large if its first two hand postures miss it, or the load has a long arm.
+
+    If grasps must resist loads, the seeds in which the fingers resist the most come first, and sets without a seed that
+    resists all loads cost more than all other sets.
+    """
+    contacts, certificate, seeds, owner, load = found
+    weak = torch.zeros_like(certificate.margin)
+    if stack.loads is not None:
+        touched = assign(contacts, seeds)
+        strength = strength_of(stack.hand, seeds, touched, stack.strongest)
+        arms, load = touched.points - touched.points.mean(1, keepdim=True), load[seeds.row, None]
+        share = resist_loads(arms, touched.normals, strength, load, stack.first.spec).margin.clamp(max=1)
+        weak = weak.scatter_reduce(0, seeds.row, share, "amax")
+        weak = torch.where(weak < 1, WEAK * (2 - weak), 0.0)
+        seeds = seeds[lexical_order(seeds.row, -share)]
     first = seeds[rank_in_group(seeds.row) < 2]
     residual = seed_costs(stack.reach(contacts, certificate, owner), first)
     least = torch.full((len(contacts),), torch.inf, dtype=residual.dtype, device=residual.device)
     least = least.scatter_reduce(0, first.row, residual, "amin")
     arm = load_arm(contacts.points, stack.body.rows(owner).center)
-    return least.clamp_min(1e-3).log() + 0.3 * (arm + 0.1).log()
+    return found._replace(seeds=seeds), least.clamp_min(1e-3).log() + 0.3 * (arm + 0.1).log() + weak
 
 
 def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:

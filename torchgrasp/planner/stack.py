@@ -21,6 +21,7 @@ from torchgrasp.plan.starts import chunk_sizes
 from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.success.body import EstimatedBody
+from torchgrasp.success.features import GRIP
 from torchgrasp.values import Certificate, ContactPlan, Contacts
 
 Owner = Int[Tensor, "b"]
@@ -70,6 +71,18 @@ class Stack:
     def first(self) -> Problem:
         """The problem of the first cloud, for what all have in common."""
         return self.problems[0]
+
+    @cached_property
+    def loads(self) -> Float[Tensor, "c w 6"] | None:
+        """The wrenches [N, N m] about the origin that grasps of each cloud must resist, or None."""
+        loads = [problem.loads for problem in self.problems if problem.loads is not None]
+        return torch.stack(loads).to(self.body.center) if loads else None
+
+    @property
+    def strongest(self) -> float:
+        """The greatest normal force [N] of a finger in the task."""
+        task = self.first.request.grasp_task
+        return task.pressing(task.lifts(self.first.spec.plane)) or GRIP
 
     @cached_property
     def library(self) -> PostureLibrary:

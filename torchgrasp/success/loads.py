@@ -11,7 +11,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.plan.closure import cone_edges, tangents
 from torchgrasp.plan.forces import grasp_map, least_friction_forces
-from torchgrasp.values import Contacts, Grasps
+from torchgrasp.values import Contacts, Grasps, IKSeeds
 
 CARRYING = 2.07  # log-odds of success that a lift loses for each factor e on the force that carries the load
 
@@ -64,22 +64,24 @@ def carrying_force(
 
 def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Float[Tensor, "g"]:
     """Return the factor on balanced contact forces at which the first drive gives its greatest torque; NaN for NaN."""
-    jacobian, pushes, effort = _levers(hand, grasps, forces)
+    jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
     return (effort / torch.einsum("gfih,gfi->gh", jacobian, pushes).abs()).amin(1)
 
 
-def strength_of(hand: Hand, grasps: Grasps, most: float) -> Float[Tensor, "g f"]:
+def strength_of(hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, most: float) -> Float[Tensor, "g f"]:
     """Return the greatest normal force [N] of each fingertip alone, by its drives, of at most `most` [N]."""
-    jacobian, pushes, effort = _levers(hand, grasps, -grasps.contacts.normals)
+    jacobian, pushes, effort = _levers(hand, held, contacts, -contacts.normals)
     alone = (effort / torch.einsum("gfih,gfi->gfh", jacobian, pushes).abs()).amin(2)
     return alone.nan_to_num(0.0).clamp(0.0, most)  # a contact that is unknown has no strength
 
 
-def _levers(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> tuple[Tensor, Tensor, Tensor]:
+def _levers(
+    hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, forces: Float[Tensor, "g f 3"]
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the Jacobians (g, f, 3, h) of the contacts, forces in the hand's frame, and the drives' efforts (h,)."""
-    joints = grasps.joints
-    hand_from_obj = inverse(grasps.obj_from_hand.to(joints))
-    jacobian = hand.jacobian(joints, apply(hand_from_obj, grasps.contacts.points.to(joints)))
+    joints = held.joints
+    hand_from_obj = inverse(held.obj_from_hand.to(joints))
+    jacobian = hand.jacobian(joints, apply(hand_from_obj, contacts.points.to(joints)))
     effort = joints.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
     return jacobian, rotate(hand_from_obj, forces.to(joints)), effort
 
