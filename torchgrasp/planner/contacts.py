@@ -55,7 +55,7 @@ def join_seeded(parts: Sequence[SeededContacts]) -> SeededContacts:
         seeds.append(dataclasses.replace(part.seeds, row=part.seeds.row + first))
         first += len(part.contacts)
     contacts, certificate = join([x.contacts for x in parts]), join([x.certificate for x in parts])
-    owner, load = (torch.cat([x[k] for x in parts]) for k in (3, 4))
+    owner, load = torch.cat([x.owner for x in parts]), torch.cat([x.load for x in parts])
     return SeededContacts(contacts, certificate, join(seeds), owner, load)
 
 
