@@ -6,8 +6,8 @@ from pathlib import Path
 
 from torchgrasp import load_hand, load_object, plan_grasps
 from torchgrasp.app.author.draft import draft_hand
-from torchgrasp.base import count_status
 from torchgrasp.files import write_file
+from torchgrasp.foundation.base import count_status
 from torchgrasp.testing import check_hand
 
 folder = Path(tempfile.mkdtemp()) / "mine"

@@ -7,8 +7,8 @@ import gc
 
 import torch
 
-from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
-from torchgrasp.control import ClosingReference, GraspController, TipContact, measure, no_contact, observe
+from torchgrasp import ClosingReference, ContactSpec, GraspController, load_hand, load_object, plan_grasps
+from torchgrasp.control import TipContact, measure, no_contact, observe
 
 PERIOD = 1 / 200  # seconds between two control ticks
 

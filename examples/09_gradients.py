@@ -2,9 +2,18 @@
 
 import torch
 
-from torchgrasp import GraspMixture, encode, fit_shape, load_hand, load_mixture, load_object, plan_grasps
+from torchgrasp import (
+    GraspMixture,
+    encode,
+    fit_mixture,
+    fit_shape,
+    load_hand,
+    load_mixture,
+    load_object,
+    plan_grasps,
+    sample_configurations,
+)
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.posture_model import fit_mixture, sample_configurations
 
 hand = load_hand("barrett")
 

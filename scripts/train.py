@@ -27,7 +27,7 @@ from train.stability import stability
 from train.success import success
 from train.trials import trials
 
-from torchgrasp.errors import GraspError
+from torchgrasp.foundation.errors import GraspError
 
 if __name__ == "__main__":
     commands = {

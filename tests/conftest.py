@@ -15,7 +15,7 @@ from torch import Tensor
 from tests import annotations
 
 if TYPE_CHECKING:
-    from torchgrasp.values import PointCloud
+    from torchgrasp.values.planning import PointCloud
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of many processes would compile the library and the tests anew
 sys.dont_write_bytecode = False
@@ -64,7 +64,7 @@ def motion(generator: torch.Generator) -> Tensor:
 @pytest.fixture(scope="session")
 def seen_cylinder() -> "PointCloud":
     """One side of a standing cylinder, r 30 mm and h 120 mm, seen from a camera 0.5 m away, with exact normals."""
-    from torchgrasp.values import PointCloud
+    from torchgrasp.values.planning import PointCloud
 
     rng = torch.Generator().manual_seed(1)
     camera = torch.tensor([0.45, 0.0, 0.3], dtype=torch.float64)

@@ -14,21 +14,21 @@ import trimesh
 from scipy.optimize import linprog
 from torch import Tensor
 
-from torchgrasp.base import named_tensors
+from torchgrasp import Scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
+from torchgrasp.contacts.form_closure import closed_exact
+from torchgrasp.foundation.base import named_tensors
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
 from torchgrasp.hand import load
 from torchgrasp.hand.hand import Hand
-from torchgrasp.plan.closure import closed_exact
 from torchgrasp.posture_model.sample import HandSamples
-from torchgrasp.scene import Scene
+from torchgrasp.shape.estimate import Normalisation, Observations
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.kernel import Kernel, KernelName, Profile, cross_covariance
-from torchgrasp.shape.values import Normalisation, Observations
-from torchgrasp.values import Contacts, PointCloud
+from torchgrasp.values.planning import Contacts, PointCloud
 
 ROOT = Path(__file__).parents[1]
 

@@ -13,8 +13,8 @@ from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.geometry.frames import rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
-from torchgrasp.specs import TrialSpec
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.values.planning import Certificate, Contacts, Grasps
+from torchgrasp.values.specs import TrialSpec
 
 RADIUS, HEIGHT = 0.03, 0.18
 POSES = {  # rotation vector, translation, joints, opened joints

@@ -6,12 +6,13 @@ from collections.abc import Iterator
 import torch
 
 from tests.make import real
-from torchgrasp.closure import ClosingGains
-from torchgrasp.control import ClosingReference, GraspController, Observation, Targets, TipContact, measure, no_contact
+from torchgrasp import ClosingReference, GraspController
+from torchgrasp.control import Observation, Targets, TipContact, measure, no_contact
 from torchgrasp.control.law import surface_covariance
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.fingers import ActuatedJoints
 from torchgrasp.hand.load import load_hand
+from torchgrasp.values.closing import ClosingGains
 
 PERIOD = 0.01
 FREE, TOUCHING = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)

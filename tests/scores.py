@@ -3,8 +3,8 @@
 import dataclasses
 import math
 
-from torchgrasp.errors import Status
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore
+from torchgrasp.evaluation.summary import ProtocolResult, ViewScore
+from torchgrasp.foundation.errors import Status
 
 GOOD = ProtocolResult(0, 0, True, Status.OK, 0.01, 0.1, 4.0, 0.002, 1.0)
 SLIPPED = dataclasses.replace(GOOD, rank=1, passed=False, status=Status.MOVED, overlap=0.004)

@@ -11,12 +11,12 @@ import torch
 from safetensors.torch import save_file
 
 from torchgrasp import load_grasps
-from torchgrasp.base import named_tensors
-from torchgrasp.errors import ModelFileError, OutputError
 from torchgrasp.files import LOCK, hold_file, hold_folder, load_tensors, read_bytes, save_tensors, sha256, write_file
+from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import ModelFileError, OutputError
+from torchgrasp.foundation.limits import TENSOR_FILE_BYTES
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
-from torchgrasp.limits import TENSOR_FILE_BYTES
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.values.planning import Certificate, Contacts, Grasps
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from tests.make import run_python
-from torchgrasp.errors import BadArgument, NoWorkers, Status
-from torchgrasp.jobs import pack, run_as_they_end, run_tasks, unpack
-from torchgrasp.planner.schedule import Batch
-from torchgrasp.values import PointCloud
+from torchgrasp.foundation.errors import BadArgument, NoWorkers, Status
+from torchgrasp.foundation.jobs import pack, run_as_they_end, run_tasks, unpack
+from torchgrasp.planner.schedule import BatchSize
+from torchgrasp.values.planning import PointCloud
 
 pytest.importorskip("pebble")
 
@@ -110,7 +110,7 @@ def test_workers_that_always_die_before_they_take_a_task_are_one_error_however_m
 
 
 SCRIPT = """
-from torchgrasp.jobs import run_tasks
+from torchgrasp.foundation.jobs import run_tasks
 print("once", flush=True)
 print(list(run_tasks(pow, [(3, 2), (4, 2)], workers=1)))
 """
@@ -133,7 +133,12 @@ def test_bad_arguments_are_named_at_once():
 def test_a_packed_value_holds_no_tensor_and_unpacks_to_the_same_value_with_its_cached_attributes():
     cloud = PointCloud(torch.rand(5, 3), None, torch.zeros(3))
     vars(cloud)["cached"] = torch.arange(3)
-    value = {"clouds": [cloud, cloud], "batch": Batch(4, 2), "pair": (torch.tensor(2.5), "text"), "class": PointCloud}
+    value = {
+        "clouds": [cloud, cloud],
+        "batch": BatchSize(4, 2),
+        "pair": (torch.tensor(2.5), "text"),
+        "class": PointCloud,
+    }
     sent = pack(value)
     assert sent["clouds"][0] is sent["clouds"][1]  # what is held twice is sent once
     packed = pickle.dumps(sent)
@@ -141,6 +146,6 @@ def test_a_packed_value_holds_no_tensor_and_unpacks_to_the_same_value_with_its_c
     found = unpack(pickle.loads(packed))  # noqa: S301 packed here
     assert torch.equal(found["clouds"][1].points, cloud.points) and found["clouds"][0].normals is None
     assert torch.equal(found["clouds"][0].cached, torch.arange(3)) and type(found["clouds"][0]) is PointCloud
-    assert found["batch"] == Batch(4, 2) and isinstance(found["batch"], Batch)
+    assert found["batch"] == BatchSize(4, 2) and isinstance(found["batch"], BatchSize)
     assert found["pair"][0].shape == () and float(found["pair"][0]) == 2.5 and found["pair"][1] == "text"
     assert found["class"] is PointCloud

@@ -8,7 +8,7 @@ import torch
 
 from tests.laws.kernels import check_kernel
 from tests.laws.scenes import check_scene
-from torchgrasp.errors import BrokenLaw, HandFileError
+from torchgrasp.foundation.errors import BrokenLaw, HandFileError
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.shape import Kernel, matern52_kernel, rbf_kernel, thin_plate_kernel

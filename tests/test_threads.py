@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import torchgrasp
+from torchgrasp.foundation.threads import one_thread, single_threaded
 from torchgrasp.shape import Kernel
-from torchgrasp.threads import one_thread, single_threaded
 
 
 @pytest.fixture(autouse=True)

@@ -13,13 +13,13 @@ import yourdfpy
 from tests.make import see
 from tests.pinch import pinch
 from torchgrasp import load_object
-from torchgrasp.base import Value, check_whole, count_status, join, pick, put
 from torchgrasp.data import load_shipped_grasp
-from torchgrasp.errors import BadArgument, FailedRows, Status, TooFewPoints
+from torchgrasp.foundation.base import Value, check_whole, count_status, join, pick, put
+from torchgrasp.foundation.errors import BadArgument, FailedRows, Status, TooFewPoints
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import hand_of
-from torchgrasp.specs import ContactSpec, TrialSpec
-from torchgrasp.values import Certificate, ContactPlan, Contacts, PointCloud
+from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, PointCloud
+from torchgrasp.values.specs import ContactSpec, TrialSpec
 
 
 def plan(status: list[int]) -> ContactPlan:

@@ -3,24 +3,46 @@
 The names below are the core of the library, in the order of the data flow. Each subpackage has more public names.
 """
 
-from torchgrasp.errors import GraspError, Status
+from torchgrasp.foundation.errors import GraspError, Status
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.specs import ContactSpec, TrialSpec
-from torchgrasp.values import Certificate, ContactCode, ContactPlan, Contacts, Grasps, PointCloud, ShapeEstimate
-from torchgrasp.closure import ClosureResult, SensorModel
-from torchgrasp.cloud import cloud_from_array, cloud_from_depth, merge_clouds, read_cloud
-from torchgrasp.scene import Scene, read_scene, save_scene
+from torchgrasp.values.specs import ContactSpec, TrialSpec
+from torchgrasp.values.planning import (
+    Certificate,
+    ContactCode,
+    ContactPlan,
+    Contacts,
+    Grasps,
+    PointCloud,
+    ShapeEstimate,
+)
+from torchgrasp.values.closing import ClosureResult, SensorModel
+from torchgrasp.cloud.read import cloud_from_array, read_cloud
+from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.cloud.prepare import merge_clouds
+from torchgrasp.scene.scene import Scene
+from torchgrasp.scene.file import read_scene, save_scene
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.data.shipped import list_objects, load_object, load_scene
-from torchgrasp.shape import ShapeGP, fit_shape
-from torchgrasp.plan import Region, certify, closure_probability, plan_contacts
-from torchgrasp.hand import Hand, load_hand
-from torchgrasp.posture_model import GraspMixture, encode, fit_mixture, load_mixture, sample_configurations
-from torchgrasp.ik import solve_ik
-from torchgrasp.success import GraspTask, explain_success
-from torchgrasp.planner import explain_empty, plan_grasps, plan_scene, stream_grasps
-from torchgrasp.control import ClosingReference, GraspController, closing_gains
-from torchgrasp.evaluation import close_hand
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.contacts.region import Region
+from torchgrasp.contacts.certify import certify
+from torchgrasp.contacts.closure_probability import closure_probability
+from torchgrasp.contacts.plan import plan_contacts
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import load_hand
+from torchgrasp.posture_model.mixture import GraspMixture, encode, load_mixture
+from torchgrasp.posture_model.training import fit_mixture
+from torchgrasp.posture_model.sample import sample_configurations
+from torchgrasp.ik.solve import solve_ik
+from torchgrasp.success.task import GraspTask
+from torchgrasp.success.reasons import explain_success
+from torchgrasp.planner.explain import explain_empty
+from torchgrasp.planner.grasps import plan_grasps, stream_grasps
+from torchgrasp.planner.scene import plan_scene
+from torchgrasp.control.reference import ClosingReference, closing_gains
+from torchgrasp.control.controller import GraspController
+from torchgrasp.evaluation.lift import close_hand
 
 __version__ = "0.1.0"
 

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import checked
-from torchgrasp.errors import BrokenLaw, HandFileError
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BrokenLaw, HandFileError
+from torchgrasp.foundation.lazy import yourdfpy
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
 from torchgrasp.hand.load import find_hand, load_hand
-from torchgrasp.hand.urdf import Shape, Urdf, read_urdf
-from torchgrasp.lazy import yourdfpy
+from torchgrasp.hand.urdf import LinkShape, Urdf, read_urdf
 
 __all__ = ["BrokenLaw", "check_hand"]
 
@@ -135,7 +135,7 @@ def _wrong_pads(urdf: Urdf, spec: HandSpec) -> Iterator[HandFileError]:
             yield spec.wrong(found, "a contact on the surface, its normal outward")
 
 
-def _inside(point: np.ndarray, shape: Shape) -> bool:
+def _inside(point: np.ndarray, shape: LinkShape) -> bool:
     x, y, z = rotation_from_rpy(shape.rpy).numpy().T @ (point - shape.xyz)
     if shape.kind == "box":
         return bool((np.abs([x, y, z]) < shape.half).all())

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import messages
 import torch
 
-from torchgrasp import load_grasps
-from torchgrasp.closure import SensorModel
-from torchgrasp.control import ClosingOptions, ClosingReference, GraspController, feel_torques, no_contact, observe
+from torchgrasp import ClosingReference, GraspController, load_grasps
+from torchgrasp.control import ClosingOptions, feel_torques, no_contact, observe
 from torchgrasp.hand import hand_of
+from torchgrasp.values.closing import SensorModel
 
 OPENING = 0.5  # greatest speed [rad/s] of a joint on its way to the pre-grasp
 SILENCE = 0.1  # time [s] without joint states after which nothing is sent: the driver then keeps its last targets

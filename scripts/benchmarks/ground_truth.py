@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.data import list_views, read_object_mesh, read_view
 from torchgrasp.geometry.mesh import closest_on_triangles
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 if TYPE_CHECKING:
     import trimesh

@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import POSE_NOISE, PoseNoise, seed_of
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane, move
-from torchgrasp.specs import TrialSpec
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
+from torchgrasp.values.specs import TrialSpec
 
 DENSITY = 500.0
 """Density [kg/m^3] of objects of unknown mass: half full, hollow, or of wood."""

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from torchgrasp import GraspMixture, fit_mixture
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model import HandSamples
 from torchgrasp.posture_model.score import BicCurve
 

@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model import HandSamples, fit_mixture
+from torchgrasp import fit_mixture
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.posture_model import HandSamples
 from torchgrasp.posture_model.score import evaluate_mixture
 
 

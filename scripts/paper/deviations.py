@@ -34,10 +34,10 @@ from torchgrasp.control.controller import CLOSING_TIME
 from torchgrasp.control.law import blend
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.data.shipped import GRASPED, load_shipped_grasp
-from torchgrasp.errors import IndefiniteCovariance
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.files import format_json, write_file
+from torchgrasp.foundation.errors import IndefiniteCovariance
 from torchgrasp.posture_model.mixture import PAPER_ENERGY, encode, load_mixture, mixture_path
 from torchgrasp.shape.conditioning import longest_distance
 from torchgrasp.shape.kernel import gram, thin_plate_kernel

@@ -6,7 +6,7 @@ import torch
 
 from torchgrasp import ContactSpec, Status, TrialSpec, close_hand, list_objects, load_hand, load_object, plan_grasps
 from torchgrasp.files import format_columns
-from torchgrasp.values import Grasps, IKSeeds
+from torchgrasp.values.planning import Grasps, IKSeeds
 
 TRIAL = TrialSpec(closing="paper", holding="impedance")
 

@@ -5,10 +5,10 @@ import math
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from torchgrasp.base import Value, check_whole
-from torchgrasp.errors import Status
 from torchgrasp.evaluation.protocols import seed_of
-from torchgrasp.specs import ClosingMode, ContactSpec, HoldingMode, Mode
+from torchgrasp.foundation.base import Value, check_whole
+from torchgrasp.foundation.errors import Status
+from torchgrasp.values.specs import ClosingMode, ContactSpec, HoldingMode, Mode
 
 Support = Literal["camera", "paper"]
 Order = Literal["success", "certain", "risky"]

@@ -12,10 +12,10 @@ import trimesh
 from benchmarks.common import timed
 
 from torchgrasp import PointCloud, ShapeGP, fit_shape, list_objects, load_object
-from torchgrasp.base import join
 from torchgrasp.files import write_file
+from torchgrasp.foundation.base import join
 from torchgrasp.shape.conditioning import posterior_given
-from torchgrasp.shape.values import off_surface, on_surface
+from torchgrasp.shape.estimate import off_surface, on_surface
 
 POINTS = 1000
 """Points of a whole cloud, as in the paper."""

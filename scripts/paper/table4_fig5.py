@@ -25,9 +25,9 @@ from torchgrasp import (
 )
 from torchgrasp.app.report.canvas import Canvas, map_colors
 from torchgrasp.app.report.stills import rotated
+from torchgrasp.contacts.closure_probability import closure_probability
 from torchgrasp.files import write_file
 from torchgrasp.geometry.linalg import farthest_points
-from torchgrasp.plan.closure_probability import closure_probability
 from torchgrasp.shape.surface import Surface, extract_surface
 
 THRESHOLDS = (0.03, 0.06, 0.10)

@@ -15,7 +15,7 @@ from paper.trials import PAPER, run_cells
 from torchgrasp.evaluation import Share
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.files import format_columns, format_json, write_file
-from torchgrasp.specs import ClosingMode, HoldingMode
+from torchgrasp.values.specs import ClosingMode, HoldingMode
 
 Asked = Annotated[TableSpec, tyro.conf.arg(name="")]
 """A spec whose fields are options of the command."""

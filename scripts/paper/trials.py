@@ -17,23 +17,22 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
-from torchgrasp import load_grasps
+from torchgrasp import close_hand, load_grasps, plan_grasps
 from torchgrasp.control.reference import check_single
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import list_objects, load_object
-from torchgrasp.errors import GraspError, Status
-from torchgrasp.evaluation import PROTOCOLS, close_hand
+from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.files import format_json, write_file
+from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.jobs import run_tasks
-from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.success.order import rank_by_variance
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.values.planning import Grasps, PointCloud
 
 if TYPE_CHECKING:
     import trimesh

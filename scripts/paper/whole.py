@@ -26,9 +26,9 @@ from paper.tables6_7 import ROWS6, ROWS7, judge_table6, judge_table7
 from paper.trials import run_cells, subjects
 from torchgrasp import __version__
 from torchgrasp.app.report.page import render
-from torchgrasp.errors import GraspError, Status
 from torchgrasp.files import format_json, hold_folder, write_file
-from torchgrasp.jobs import run_tasks
+from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.jobs import run_tasks
 
 NOTE = (
     "Of M. Li, K. Hang, D. Kragic, A. Billard, <em>Dexterous grasping under shape uncertainty</em>, Robotics and "

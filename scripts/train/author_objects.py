@@ -12,10 +12,10 @@ from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data.shipped import DATA, SCENE, list_objects
-from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.golden import GOLDEN, run_golden
 from torchgrasp.files import write_file
-from torchgrasp.specs import Simulator
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.values.specs import Simulator
 
 VIEWS = {"cylinder": (20.0, 30.0), "jug": (60.0, 35.0), "rabbit": (55.0, 30.0), "spray": (50.0, 25.0)}
 """Azimuth and elevation [deg] of the camera for each object."""

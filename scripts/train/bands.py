@@ -16,8 +16,8 @@ from benchmarks.ground_truth import read_views, sample_mesh
 
 from torchgrasp.data import read_entry
 from torchgrasp.files import format_columns
+from torchgrasp.shape.extra_observations import STD_FACTORS
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.shape.support import STD_FACTORS
 
 NORMAL_SHARES = (0.683, 0.954, 0.997)
 """What a normal distribution holds within 1, 2 and 3 deviations."""
@@ -33,7 +33,7 @@ Row = dict[str, Any]
 
 
 def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views: tuple[str, ...] = ()) -> None:
-    """Print the factors for `torchgrasp/shape/support.py`, and what bands hold on families left out.
+    """Print the factors for `torchgrasp/shape/extra_observations.py`, and what bands hold on families left out.
 
     Args:
         objects: a folder of objects as `torchgrasp.data` reads it.

@@ -13,14 +13,14 @@ from tqdm import tqdm
 
 from torchgrasp.campaign.folder import ASKED, PARTS
 from torchgrasp.data.shards import JobRow, load_shard
+from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.jobs import run_tasks
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import FEATURES, measure_grasps
 from torchgrasp.success.model import SuccessModel
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.values.planning import Grasps, PointCloud
 from train.trials import BEST, SPREAD, Trial, read_rows
 
 LIMIT = 7200.0

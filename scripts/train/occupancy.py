@@ -13,13 +13,13 @@ import trimesh
 import tyro
 from benchmarks.scene.scenes import scatter
 
+from torchgrasp import Scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.errors import BadArgument
 from torchgrasp.files import format_json, write_file
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, upright_frame
-from torchgrasp.scene import Scene
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.occupancy import (
     ABOVE,
@@ -27,7 +27,7 @@ from torchgrasp.scene.occupancy import (
     NOISE,
     SIDEWAYS,
     cast_shadows,
-    load_model,
+    load_occupancy_model,
     probability,
     shadow_features,
 )
@@ -151,7 +151,7 @@ def occupancy(objects: tyro.conf.Positional[Path], scenes: int = 30, model: Path
     content = {kind: fit(*seen[kind], KNOTS[kind]) for kind in KNOTS}
     note = f"{scenes} rendered scenes of 5 to 8 objects of {len(families) // 2} families"
     write_file(model, format_json({**content, "fitted_on": note}) + "\n")
-    load_model.cache_clear()
+    load_occupancy_model.cache_clear()
     for kind, (features, full) in unseen.items():
         p = probability(kind, torch.from_numpy(features)).numpy()
         print(f"{kind}: {full.mean():.3f} full, Brier {np.mean((p - full) ** 2):.4f} of {full.var():.4f}")

@@ -10,8 +10,8 @@ from typing import Annotated
 import torch
 import tyro
 
-from torchgrasp import load_hand
-from torchgrasp.posture_model import HandSamples, fit_mixture
+from torchgrasp import fit_mixture, load_hand
+from torchgrasp.posture_model import HandSamples
 from torchgrasp.posture_model.sample import sample_configurations
 
 COMPONENTS = {"allegro": 41, "barrett": 60}

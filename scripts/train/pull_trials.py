@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
+from torchgrasp.foundation.base import Value
 from torchgrasp.geometry.frames import rotation_angle
-from torchgrasp.specs import TrialSpec
+from torchgrasp.values.closing import ClosingOptions
+from torchgrasp.values.specs import TrialSpec
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Joint targets from an observation and the period [s]."""

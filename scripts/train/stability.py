@@ -18,6 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchgrasp import (
+    ClosingReference,
     ContactSpec,
     Grasps,
     Hand,
@@ -28,17 +29,16 @@ from torchgrasp import (
     load_object,
     plan_grasps,
 )
-from torchgrasp.base import Batch
-from torchgrasp.control import ClosingReference
 from torchgrasp.control.paper.closings import Impedance
 from torchgrasp.control.paper.stability import FILE, NAMES, StabilityModel, lengths_of, state_of
-from torchgrasp.errors import BadArgument, GraspError
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.files import load_tensors, save_tensors
+from torchgrasp.foundation.base import Batch
+from torchgrasp.foundation.errors import BadArgument, GraspError
+from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.jobs import run_tasks
-from torchgrasp.posture_model.em import Shard, expectation_maximisation, start_components
+from torchgrasp.posture_model.em import DataRows, expectation_maximisation, start_components
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import describe_compatibility
 from train.pull_trials import PullRecord, RisingPull, pull_until_lost
@@ -192,7 +192,7 @@ def _fit(states: Float[Tensor, "n 9"], components: int, seed: int) -> GaussianMi
     if not 1 <= components <= n // (d + 2):
         raise BadArgument("components", f"{components} for {n} states", f"1 to {n // (d + 2)}")
     centre, scale = states.mean(0), states.std(0, correction=0)
-    shard = Shard((states - centre) / scale)
+    shard = DataRows((states - centre) / scale)
     start = start_components(shard, components, seed, REGULARISATION)
     fitted = expectation_maximisation(shard, start, 300, 1e-4, REGULARISATION).components
     covariances = fitted.covariances * scale[:, None] * scale

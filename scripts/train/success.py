@@ -16,9 +16,9 @@ from numpy import ndarray as Array
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.linear_model import LogisticRegression
 
-from torchgrasp.base import named_tensors
-from torchgrasp.evaluation import score
+from torchgrasp.evaluation import summary as score
 from torchgrasp.files import save_tensors
+from torchgrasp.foundation.base import named_tensors
 from torchgrasp.success.features import CAUSES, FEATURES
 from torchgrasp.success.model import KIND, MODEL, SuccessModel
 from train.household import CALIBRATING

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.base import Value
 from torchgrasp.evaluation import PROTOCOLS, PoseNoise, Protocol
 from torchgrasp.evaluation.protocols import POSE_NOISE
-from torchgrasp.specs import ClosingMode
+from torchgrasp.foundation.base import Value
 from torchgrasp.success.task import GraspTask
+from torchgrasp.values.specs import ClosingMode
 
 FRICTION, MASS, FORCE = (0.2, 1.0), (0.02, 1.0), (2.0, 10.0)
 """Least and greatest friction, mass [kg] (even in its logarithm) and force [N] of the strongest finger."""

@@ -17,31 +17,31 @@ import torch
 import tyro
 from tqdm import tqdm
 
+from torchgrasp import plan_grasps
 from torchgrasp.campaign.cluster import check_versions, empty_shard, run_on_cluster, versions
 from torchgrasp.campaign.folder import README, Campaign, carry_out
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.sensor import SensorName
 from torchgrasp.data.reader import GraspShards
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
-from torchgrasp.errors import GraspError, Status
 from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.files import sha256, write_file
+from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.jobs import run_as_they_end
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.jobs import run_as_they_end
-from torchgrasp.planner import plan_grasps
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import surface_field
-from torchgrasp.specs import ContactSpec
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import measure_grasps
-from torchgrasp.success.model import MODEL, load_model
-from torchgrasp.success.order import is_known
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.success.model import MODEL, load_success_model
+from torchgrasp.success.order import is_covered
+from torchgrasp.values.planning import Grasps, PointCloud
+from torchgrasp.values.specs import ContactSpec
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
 from train.tasks import FRICTION, ORDINARY_FRICTION, PULL, Task, draw_ordinary, draw_task
 
@@ -199,7 +199,7 @@ def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) 
     body, best = EstimatedBody.of(shape), list[int]()
     for task in tasks:
         features = measure_grasps(hand, body, grasps, task.friction, task.known, task.lift)
-        best.append(int(load_model().log_odds(features).where(is_known(features), -torch.inf).argmax()))
+        best.append(int(load_success_model().log_odds(features).where(is_covered(features), -torch.inf).argmax()))
     return best
 
 

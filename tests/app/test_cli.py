@@ -12,12 +12,13 @@ import trimesh
 from tests.make import run_python
 from torchgrasp import GraspTask, load_grasps
 from torchgrasp.app import cli
-from torchgrasp.app.cli import grasps, inputs
+from torchgrasp.app.cli import grasp as grasps
+from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.evaluate import print_score
 from torchgrasp.app.cli.inputs import check_folder
 from torchgrasp.data.shipped import DATA
-from torchgrasp.errors import MissingExtra
-from torchgrasp.evaluation.score import ViewScore
+from torchgrasp.evaluation.summary import ViewScore
+from torchgrasp.foundation.errors import MissingExtra
 
 VIEW = str(DATA / "cylinder" / "view.ply")
 MESH = str(DATA / "cylinder" / "mesh.ply")

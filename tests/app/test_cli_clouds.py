@@ -12,28 +12,20 @@ import trimesh
 from PIL import Image
 
 from tests.make import box
+from torchgrasp import Scene, read_cloud, read_scene
 from torchgrasp.app import cli
-from torchgrasp.app.cli import grasps
+from torchgrasp.app.cli import grasp as grasps
 from torchgrasp.app.cli.inputs import CloudOptions, ViewOptions
-from torchgrasp.cloud import (
-    diagnose_cloud,
-    estimate_normals,
-    look_at,
-    partial_view,
-    read_cloud,
-    read_cloud_file,
-    save_cloud,
-)
+from torchgrasp.cloud import diagnose_cloud, estimate_normals, look_at, partial_view, read_cloud_file, save_cloud
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.cloud.check import remove_outliers
-from torchgrasp.cloud.tables import read_image
+from torchgrasp.cloud.safe_files import read_image_file
 from torchgrasp.data.shipped import DATA, load_object, load_scene
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, as_plane
-from torchgrasp.scene import Scene, read_scene
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 VIEW = DATA / "jug" / "view.ply"
 POSE = look_at(30.0, 40.0, 0.6, torch.tensor([0.0, 0.0, 0.07], dtype=torch.float64))
@@ -489,10 +481,10 @@ def test_exr_gives_its_channel_of_depth(tmp_path, monkeypatch):
     package = SimpleNamespace(File=lambda path: SimpleNamespace(channels=lambda: channels))
     monkeypatch.setitem(sys.modules, "OpenEXR", package)
     (tmp_path / "d.exr").write_bytes(b"v/1\x01")
-    assert np.array_equal(read_image("depth", tmp_path / "d.exr"), depth)
+    assert np.array_equal(read_image_file("depth", tmp_path / "d.exr"), depth)
     channels["Other.Z"] = channels["RGB"]
     with pytest.raises(BadArgument, match="channels"):
-        read_image("depth", tmp_path / "d.exr")
+        read_image_file("depth", tmp_path / "d.exr")
 
 
 @pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0)])

@@ -10,11 +10,10 @@ import trimesh
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
-from torchgrasp import Status, load_grasps, save_scene
+from torchgrasp import Scene, Status, load_grasps, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.planner import ScenePlan, ThingPlan
-from torchgrasp.scene import Scene, read_scene
 
 CAMERA = look_at(20.0, 45.0, 0.7)
 
@@ -58,8 +57,8 @@ def middle(labels: np.ndarray, label: int) -> tuple[str, str]:
 
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch):
-    monkeypatch.setattr("torchgrasp.app.cli.grasps.write_report", lambda path, run, view: path)
-    monkeypatch.setattr("torchgrasp.app.cli.grasps.write_viewer", lambda path, run: path)
+    monkeypatch.setattr("torchgrasp.app.cli.grasp.write_report", lambda path, run, view: path)
+    monkeypatch.setattr("torchgrasp.app.cli.grasp.write_viewer", lambda path, run: path)
 
 
 @pytest.mark.parametrize("click", [True, False])
@@ -85,7 +84,7 @@ def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, gr
         assert task.mass == 0.4 and promise == 0.8 and resist == ("lift",)
         return ScenePlan((thing,))
 
-    monkeypatch.setattr("torchgrasp.app.cli.grasps.plan_scene", note)
+    monkeypatch.setattr("torchgrasp.app.cli.grasp.plan_scene", note)
     for wanted, passed in (("default", None), ("f3,f1,f2", None), ("auto", "auto")):
         code, words = grasp(seen, "--fingers", wanted, "--mass", "0.4", "--promise", "0.8", "--resist", "lift")
         assert asked.pop() == (("f3", "f1", "f2") if "," in wanted else ("f1", "f2", "f3"), passed)
@@ -110,7 +109,7 @@ def planned(monkeypatch):
         raise BadArgument("stop", "a scene", "none")
 
     for name in ("plan_grasps", "plan_scene"):
-        monkeypatch.setattr(f"torchgrasp.app.cli.grasps.{name}", note)
+        monkeypatch.setattr(f"torchgrasp.app.cli.grasp.{name}", note)
     return scenes
 
 

@@ -13,7 +13,7 @@ from torchgrasp import load_object, plan_grasps
 from torchgrasp.app.author import clean_arm
 from torchgrasp.arm import load_arm
 from torchgrasp.arm.reach import measure_ease, reach_poses
-from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.planner.changes import list_changes
 from torchgrasp.planner.request import Request

@@ -10,8 +10,8 @@ from benchmarks.ur5e import ur5e, ur5e_urdf
 from tests.make import distance_field, random_motion, real
 from torchgrasp import ContactSpec, Plane, Status, load_object, plan_grasps
 from torchgrasp.arm.reach import follow_grasps, way_of
-from torchgrasp.errors import BadArgument
 from torchgrasp.export import format_motion, plan_motion
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import move
 from torchgrasp.ik import CollisionWorld
 

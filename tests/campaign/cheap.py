@@ -10,9 +10,9 @@ import torch
 
 from torchgrasp.campaign.folder import Campaign
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard
-from torchgrasp.errors import Status
-from torchgrasp.jobs import run_as_they_end
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.jobs import run_as_they_end
+from torchgrasp.values.planning import Certificate, Contacts, Grasps
 
 JOINTS, FINGERS, TRIES = 4, 3, 2
 """Sizes of the records."""

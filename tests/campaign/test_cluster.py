@@ -26,14 +26,14 @@ from tests.campaign.cheap import (
 from tests.campaign.conftest import QUICK
 from tests.make import same_bits
 from torchgrasp import load_hand
+from torchgrasp.campaign import campaign as run_module
 from torchgrasp.campaign import cluster as cluster_module
 from torchgrasp.campaign import folder as folder_module
-from torchgrasp.campaign import run as run_module
 from torchgrasp.campaign import run_campaign
 from torchgrasp.campaign.cluster import OnGpu, plan_jobs, run_on_cluster
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.data import read_shards
-from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError, Status
 
 distributed = pytest.importorskip("distributed")
 JOBS = 17

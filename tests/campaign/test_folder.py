@@ -15,8 +15,8 @@ import torch
 from tests.campaign.cheap import ASKED, campaign, cheap_job, contents, die_at, records, wait_at, work_on
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.data import read_shards
-from torchgrasp.errors import ModelFileError, OutputError, Status
 from torchgrasp.files import hold_folder
+from torchgrasp.foundation.errors import ModelFileError, OutputError, Status
 
 JOBS = 21
 

@@ -14,9 +14,9 @@ from torchgrasp.app import cli
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign import cluster as job_module
 from torchgrasp.data import read_shards, read_view
-from torchgrasp.errors import BadArgument, DatasetError
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, evaluate
-from torchgrasp.evaluation.views import View
+from torchgrasp.evaluation.views import ObjectView
+from torchgrasp.foundation.errors import BadArgument, DatasetError
 
 
 @pytest.mark.sim
@@ -89,7 +89,7 @@ def test_a_fault_of_the_machine_is_no_row_of_a_job(carton: Path, monkeypatch):
         raise OSError("no space left")
 
     monkeypatch.setattr(job_module, "plan_view", fail)
-    view = View(carton, "carton", "view0", load_hand("barrett").source)
+    view = ObjectView(carton, "carton", "view0", load_hand("barrett").source)
     meta = {"campaign": "x", "versions": json.dumps(job_module.versions())}
     with pytest.raises(OSError, match="no space left"):
         job_module.run_job(view, LIFT, EvaluationSpec(), meta)
@@ -117,7 +117,7 @@ def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, c
 
 def test_other_versions_and_hands_on_a_machine_end_the_campaign(carton: Path):
     source = load_hand("barrett").source
-    view, spec = View(carton, "carton", "view0", source), EvaluationSpec()
+    view, spec = ObjectView(carton, "carton", "view0", source), EvaluationSpec()
     with pytest.raises(BadArgument, match=r"workers: expected .*got one with"):
         job_module.run_job(view, LIFT, spec, {"campaign": "x", "versions": "{}"})
     other = dataclasses.replace(view, hand=source._replace(sha256="0"))

@@ -8,9 +8,9 @@ import trimesh
 
 from torchgrasp.cloud.agreement import check_agreement, check_foot, check_mesh, check_stand
 from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 BOX = trimesh.creation.box((0.08, 0.06, 0.12))
 BOX.apply_translation((0.0, 0.0, 0.06))

@@ -6,7 +6,7 @@ import trimesh
 from torchgrasp.cloud.camera import INTRINSICS, cast_mesh, look_at, partial_view, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.sensor import add_noise
-from torchgrasp.errors import BadArgument, MeshError
+from torchgrasp.foundation.errors import BadArgument, MeshError
 from torchgrasp.geometry.frames import inverse
 
 

@@ -4,8 +4,8 @@ import torch
 from tests.make import real
 from torchgrasp.cloud.check import check_cloud, remove_duplicates, remove_outliers, voxel_downsample
 from torchgrasp.data.shipped import list_objects, load_object
-from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
-from torchgrasp.values import PointCloud
+from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.values.planning import PointCloud
 
 
 def cloud(n=50, scale=0.1, seed=0):

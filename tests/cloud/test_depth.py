@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchgrasp.cloud.depth import cloud_from_depth, read_depth
-from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 K = torch.tensor([[600.0, 0, 30], [0, 550.0, 20], [0, 0, 1]], dtype=torch.float64)

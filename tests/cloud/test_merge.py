@@ -8,11 +8,11 @@ from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
 from torchgrasp.cloud.prepare import clean_cloud, merge_clouds
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.data.shipped import load_object
-from torchgrasp.errors import BadArgument, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, TooFewPoints
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 EYE = torch.eye(4, dtype=torch.float64)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchgrasp.cloud.read import read_cloud_file
-from torchgrasp.errors import CloudFileError
+from torchgrasp.foundation.errors import CloudFileError
 
 POINTS = np.random.default_rng(0).uniform(0.01, 0.09, (60, 3)).round(4)
 NORMALS = np.random.default_rng(1).normal(size=(60, 3))

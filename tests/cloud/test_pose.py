@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from tests.make import box
+from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
-from torchgrasp.scene import Scene, read_scene, save_scene
 
 GL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
 OPTICAL = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).double()  # link_from_optical

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.make import directions
 from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.cloud.neighbours import fit_planes
+from torchgrasp.cloud.neighbours import fit_local_planes
 from torchgrasp.cloud.prepare import (
     MAX_POINTS,
     clean_cloud,
@@ -17,10 +17,10 @@ from torchgrasp.cloud.prepare import (
 )
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.data.shipped import list_objects, load_object
-from torchgrasp.errors import TooFewPoints
+from torchgrasp.foundation.errors import TooFewPoints
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 
 def truth(mesh, points):
@@ -38,7 +38,7 @@ def check_normals(cloud):
 
 
 def estimate_viewpoint(cloud):
-    return guess_viewpoint(cloud.points, fit_planes(cloud.points)[0])[0]
+    return guess_viewpoint(cloud.points, fit_local_planes(cloud.points)[0])[0]
 
 
 def flip(cloud, share, seed=0):

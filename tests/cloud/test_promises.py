@@ -8,10 +8,10 @@ import torch
 
 from tests.make import ball
 from torchgrasp.cloud import check, diagnose, prepare
-from torchgrasp.errors import BadArgument, Flat, GraspError, SuspiciousScale, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, Flat, GraspError, SuspiciousScale, TooFewPoints
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 FUNCTIONS = {
     "check_cloud": check.check_cloud,

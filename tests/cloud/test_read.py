@@ -10,9 +10,16 @@ import trimesh
 
 from torchgrasp.cloud.pcd import decompress
 from torchgrasp.cloud.read import cloud_from_array, read_cloud, read_cloud_file, save_cloud
-from torchgrasp.errors import BadArgument, CloudFileError, GraspError, OutputError, SuspiciousScale, TooFewPoints
 from torchgrasp.files.columns import read_lines
-from torchgrasp.values import PointCloud
+from torchgrasp.foundation.errors import (
+    BadArgument,
+    CloudFileError,
+    GraspError,
+    OutputError,
+    SuspiciousScale,
+    TooFewPoints,
+)
+from torchgrasp.values.planning import PointCloud
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import trimesh
 
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
 from torchgrasp.cloud.sensor import ACTIVE_STEREO, SENSORS, SensorNoise, add_noise, estimate_noise, median_depth
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane
 

@@ -10,11 +10,11 @@ from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.diagnose import diagnose_cloud
-from torchgrasp.cloud.neighbours import draw_rows, fit_planes
+from torchgrasp.cloud.neighbours import draw_rows, fit_local_planes
 from torchgrasp.cloud.viewpoint import can_see, guess_viewpoint
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.geometry.frames import apply, inverse, rotation_from_vector
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 ELEVATIONS = (20.0, 45.0, 70.0)
 
@@ -38,7 +38,7 @@ def test_a_guessed_camera_is_above_the_support_in_any_frame(name, elevation):
     turn = rotation_from_vector(torch.tensor([1.0, 0.7, elevation]).double())
     for table in (True, False):  # the support is seen, or its normal is given
         points = view(name, elevation, table)[0].points.double() @ turn.T
-        guess, angle = guess_viewpoint(points, fit_planes(points)[0], None if table else turn[:, 2])
+        guess, angle = guess_viewpoint(points, fit_local_planes(points)[0], None if table else turn[:, 2])
         assert float(guess @ turn[:, 2]) > float((points @ turn[:, 2]).min()) and 0 < angle <= 180
 
 
@@ -57,7 +57,7 @@ def test_a_cloud_in_the_frame_of_its_camera_is_told(name, elevation, known):
 @pytest.mark.parametrize("name", list_objects())
 def test_a_possible_viewpoint_is_kept_and_one_below_is_not(name, elevation):
     points = view(name, elevation, table=True)[0].points.double()
-    normals, (_, pose) = fit_planes(points)[0], view(name, elevation)
+    normals, (_, pose) = fit_local_planes(points)[0], view(name, elevation)
     assert can_see(points, normals, pose[:3, 3])
     if elevation < 60:  # from far below, a table hides few points of what stands on it
         assert not can_see(points, normals, 2 * points.mean(0) - pose[:3, 3])
@@ -68,6 +68,6 @@ def test_a_rendered_scene_in_the_frame_of_its_camera_keeps_the_origin():
     depth = render_depth([box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose)[0]
     points = cloud_from_depth(torch.where(depth < 1.0, depth, 0.0), INTRINSICS).points
     points = points[draw_rows(len(points), 3000)]
-    assert can_see(points, fit_planes(points)[0], torch.zeros(3).double())
+    assert can_see(points, fit_local_planes(points)[0], torch.zeros(3).double())
     base = apply(pose, points)  # in the frame of the table, the origin cannot have been the camera
-    assert not can_see(base, fit_planes(base)[0], torch.zeros(3).double())
+    assert not can_see(base, fit_local_planes(base)[0], torch.zeros(3).double())

@@ -8,13 +8,12 @@ import torch
 from scipy.optimize import minimize
 
 from tests.point_fingers import NORMALS, PERIOD, close_on_block, real, reference
-from torchgrasp import Plane
-from torchgrasp.closure import ClosingOptions
-from torchgrasp.control import GraspController
+from torchgrasp import GraspController, Plane
 from torchgrasp.control.law import surface_covariance
 from torchgrasp.control.object_pose import ContactPlanes
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.values.closing import ClosingOptions
 
 AROUND = unit(real([[1, 0.3, 0.1], [-0.4, 1, 0], [-0.5, -0.9, 0.2]]))
 """Normals that span the plane across z, and a little more."""

@@ -7,14 +7,14 @@ import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
 from torchgrasp import TrialSpec
-from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.controller import CLOSING_TIME, GraspController
-from torchgrasp.control.forces import desired_forces
+from torchgrasp.control.finger_forces import desired_forces
 from torchgrasp.control.holding import RAMP, ForceHold, GripHold, held_forces
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.control.recovery import PRESSING_TIME
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import fibonacci_sphere
+from torchgrasp.values.closing import ClosingOptions
 
 PRESSED = (2.0, 2.0, 4.0)
 CLOSE = TARGET * real([1.0, 1.0, 0.2])  # two contacts side by side: unequal forces need little friction

@@ -8,13 +8,13 @@ import torch
 from tests.control.test_localization import CENTER, RADIUS, ball_field
 from tests.point_fingers import PERIOD, observation, on_table, real
 from torchgrasp import ClosingReference, GraspController, load_hand
-from torchgrasp.closure import ClosingOptions, SensorModel
 from torchgrasp.control import no_contact, observe
 from torchgrasp.control.object_pose import FINE_TURNS, TURNS
 from torchgrasp.control.recovery import ACCELERATION, SPEED, GuardedApproach
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.values.closing import ClosingOptions, SensorModel
 
 ALL = ClosingOptions()
 DOWN, LENGTH, TIP = real([0.0, -1.0, 0.0]), 0.08, 0.01

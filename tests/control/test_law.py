@@ -9,7 +9,7 @@ import torch
 
 from tests.make import directions
 from torchgrasp import ClosingReference, closing_gains, load_hand
-from torchgrasp.control.forces import contacts_in_hand, desired_forces, joint_stiffness, tip_compliance
+from torchgrasp.control.finger_forces import contacts_in_hand, desired_forces, joint_stiffness, tip_compliance
 from torchgrasp.control.law import (
     FORCE_BANDWIDTH,
     FORCE_FLOOR,
@@ -28,7 +28,7 @@ from torchgrasp.control.law import (
 )
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.frames import apply, inverse, rotate
 
 

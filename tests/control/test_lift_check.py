@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.point_fingers import FREE, PERIOD, TOUCHING, observation, on_table
-from torchgrasp.closure import SensorModel
 from torchgrasp.control.recovery import LiftCheck
+from torchgrasp.values.closing import SensorModel
 
 ONE = torch.tensor([True, False, False])
 

@@ -18,14 +18,13 @@ from tests.point_fingers import (
     real,
     reference,
 )
-from torchgrasp import ContactSpec, GraspController
-from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
-from torchgrasp.control import ClosingReference
+from torchgrasp import ClosingReference, ContactSpec, GraspController
 from torchgrasp.control.controller import CLOSING_TIME
 from torchgrasp.control.recovery import MISPLACED, OPENING_TIME, PRESSING_TIME, GraspCheck, Reopening
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.values.closing import NO_OPTIONS, ClosingOptions, SensorModel
 
 STILL, PLACE = torch.zeros(3).double(), torch.zeros(6).double()
 

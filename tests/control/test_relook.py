@@ -12,10 +12,10 @@ from tests.point_fingers import PERIOD, real
 from torchgrasp import GraspController, Plane, PointCloud
 from torchgrasp.cloud.camera import look_at
 from torchgrasp.control.relook import relocate
-from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation import GraspTrial, Truth
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.views import _camera_of
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import field_from_surface

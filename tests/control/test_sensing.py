@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
-from torchgrasp import TrialSpec
-from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
-from torchgrasp.control import FingertipSensor, GraspController, TipContact, feel_flags, feel_torques, no_contact
+from torchgrasp import GraspController, TrialSpec
+from torchgrasp.control import FingertipSensor, TipContact, feel_flags, feel_torques, no_contact
 from torchgrasp.control.holding import MAX_FACTOR, ForceHold
 from torchgrasp.control.sensing import TORQUE_NOISE, WAITING_FORCE, DriveFeel
 from torchgrasp.control.uncertainty_closing import STALLED, UncertaintyClosing
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.values.closing import NO_OPTIONS, ClosingOptions, SensorModel
 
 WAIT_ALONE = dataclasses.replace(NO_OPTIONS, wait=True)
 JACOBIAN = torch.eye(9).double().reshape(3, 3, 9)

@@ -19,9 +19,7 @@ from tests.point_fingers import (
     real,
     reference,
 )
-from torchgrasp import Plane
-from torchgrasp.closure import NO_OPTIONS, ClosingOptions
-from torchgrasp.control import ClosingReference, GraspController
+from torchgrasp import ClosingReference, GraspController, Plane
 from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, position_gain, surface_covariance
 from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing, PositionClosing
 from torchgrasp.control.reference import next_target
@@ -34,6 +32,7 @@ from torchgrasp.control.uncertainty_closing import (
     rim_contacts,
     with_equal_gains,
 )
+from torchgrasp.values.closing import NO_OPTIONS, ClosingOptions
 
 ONE, TWO = torch.tensor([True, False, False]), torch.tensor([True, True, False])
 RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0)

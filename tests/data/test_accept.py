@@ -15,7 +15,7 @@ from torchgrasp import cloud_from_array, load_hand, load_object, save_scene
 from torchgrasp.cloud import save_cloud
 from torchgrasp.data import load_shipped_grasp
 from torchgrasp.data.accept import as_cloud, as_hand, as_seen
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 
 VIEW = load_object("cylinder").view
 ARRAY = VIEW.points.numpy()

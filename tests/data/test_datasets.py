@@ -11,7 +11,7 @@ import trimesh
 from torchgrasp import PointCloud
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view, write_objects
-from torchgrasp.errors import BadArgument, MeshError
+from torchgrasp.foundation.errors import BadArgument, MeshError
 
 
 @pytest.fixture

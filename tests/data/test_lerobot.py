@@ -14,7 +14,7 @@ from tests.data.others import read_foreign
 from tests.make import load_hand
 from torchgrasp import ClosureResult, TrialSpec, close_hand, load_object
 from torchgrasp.data import load_shipped_grasp, write_lerobot
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 
 pytest.importorskip("pyarrow")
 pytestmark = pytest.mark.sim

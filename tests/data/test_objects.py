@@ -7,7 +7,7 @@ import trimesh
 from train.object_shapes import author
 
 from torchgrasp.data.shipped import DATA, list_objects, load_object
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 
 
 @pytest.fixture(scope="module", params=list_objects())

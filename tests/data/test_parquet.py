@@ -16,7 +16,7 @@ from tests.make import load_hand
 from torchgrasp.app import cli
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.data import GraspShards, read_shards, write_parquet
-from torchgrasp.errors import BadArgument, MissingExtra, ModelFileError, OutputError, Status
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, ModelFileError, OutputError, Status
 from torchgrasp.geometry.frames import apply
 
 parquet = pytest.importorskip("pyarrow.parquet")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.devices.elsewhere import DEVICE, Elsewhere, pretend
 from torchgrasp import ContactSpec, Grasps, Hand, ShapeGP, fit_shape, load_hand, load_object, plan_grasps
-from torchgrasp.base import Value
+from torchgrasp.foundation.base import Value
 
 
 @pytest.fixture

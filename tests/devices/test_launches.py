@@ -10,8 +10,8 @@ from tests.devices.conftest import sent
 from tests.devices.elsewhere import DEVICE, elsewhere
 from tests.devices.launches import Launches
 from torchgrasp import ContactSpec, load_object, plan_grasps
-from torchgrasp.base import map_tensors
-from torchgrasp.values import PointCloud
+from torchgrasp.foundation.base import map_tensors
+from torchgrasp.values.planning import PointCloud
 
 KNOWN = {
     "outside": "",
@@ -34,12 +34,12 @@ KNOWN = {
     "ik/joint.py": "solve",
     "ik/motion.py": "_clearance find_approach",
     "ik/seeds.py": "_drawn nearest_postures",
-    "plan/certify.py": "_prove check_unit forward",
-    "plan/closure.py": "_closed_in_plane maximise rank_ratio",
-    "plan/feasibility.py": "check_feasibility normal_variation",
-    "plan/problem.py": "of",
-    "plan/solve.py": "plan_chunk",
-    "plan/starts.py": "candidate_rows qualify settle_flatness",
+    "contacts/certify.py": "_prove check_unit forward",
+    "contacts/form_closure.py": "_closed_in_plane maximise rank_ratio",
+    "contacts/feasibility.py": "check_feasibility normal_variation",
+    "contacts/problem.py": "of",
+    "contacts/plan.py": "plan_chunk",
+    "contacts/starts.py": "candidate_rows qualify settle_flatness",
     "planner/batches.py": "_on_fixed_contacts _part _relax _solve_joint _without rank select",
     "planner/report.py": "_tell end_batch",
     "planner/contacts.py": "_choose contact_costs find_contacts select spread_rows take",
@@ -53,9 +53,9 @@ KNOWN = {
     "shape/fit.py": "_warn_of_ambiguity fit_upright",
     "shape/gp.py": "of",
     "shape/posterior.py": "n_oriented",
-    "shape/support.py": "camera_support frame_around free_space free_space_violations",
+    "shape/extra_observations.py": "camera_support frame_around free_space free_space_violations",
     "shape/surface.py": "_carry_cloud _grid _trace_wall collision_field mean",
-    "shape/values.py": "least_noise normalise rows",
+    "shape/estimate.py": "least_noise normalise rows",
     "success/body.py": "around",
     "success/features.py": "_normal_deviation measure_grasps",
     "success/model.py": "depth",

@@ -9,7 +9,9 @@ from benchmarks.ur5e import ur5e
 from tests.devices.conftest import same, sent
 from tests.devices.elsewhere import DEVICE
 from torchgrasp import (
+    ClosingReference,
     ContactSpec,
+    GraspController,
     PointCloud,
     Region,
     certify,
@@ -31,16 +33,16 @@ from torchgrasp import (
 from torchgrasp.cloud import cut_object, estimate_normals, remove_outliers, voxel_downsample
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.prepare import clean_cloud, prepare_cloud
-from torchgrasp.control import ClosingReference, GraspController, measure, no_contact, observe, squeeze
+from torchgrasp.contacts import least_friction_forces
+from torchgrasp.control import measure, no_contact, observe, squeeze
 from torchgrasp.control.tactile import TipContact
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.ik import CollisionWorld, IKSolution, Obstacles, PostureLibrary, nearest_postures
 from torchgrasp.ik.seeds import query_mixture
-from torchgrasp.plan import least_friction_forces
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
 from torchgrasp.testing import random_joints
-from torchgrasp.values import ContactPlan
+from torchgrasp.values.planning import ContactPlan
 
 SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
 VIEW = load_object("cylinder").view

@@ -9,13 +9,13 @@ import torch
 from tests.make import real
 from tests.pinch import cylinder, pinch
 from torchgrasp import Status, TrialSpec
-from torchgrasp.app.report.evaluation import format_evaluation, list_causes
-from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.app.report.evaluation_page import format_evaluation, list_causes
 from torchgrasp.evaluation import GraspTrial, Truth
 from torchgrasp.evaluation.causes import CAUSES, find_cause
 from torchgrasp.evaluation.regrasp import LiftTry
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore, summarise
+from torchgrasp.evaluation.summary import ProtocolResult, ViewScore, summarise
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.values.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 
 CENTRE = real([0.0, 0.0, 0.09])
 TICKS = (

@@ -9,15 +9,15 @@ import torch
 import trimesh
 
 from tests.pinch import HEIGHT, QUICK, close, cylinder, digest, digest_elsewhere, pinch, quick_trial
-from torchgrasp import Plane, TrialSpec, load_hand
-from torchgrasp.closure import ClosingOptions
+from torchgrasp import Plane, TrialSpec, close_hand, load_hand
 from torchgrasp.control import observe
-from torchgrasp.errors import BadArgument, MeshError, Status
-from torchgrasp.evaluation import GraspTrial, Truth, close_hand
+from torchgrasp.evaluation import GraspTrial, Truth
 from torchgrasp.evaluation.lift import LIFT_TIME, _Lift, lift_grasp
 from torchgrasp.evaluation.trial import TrialDriver, derive_reference
+from torchgrasp.foundation.errors import BadArgument, MeshError, Status
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.signed_distance import field_from_surface
+from torchgrasp.values.closing import ClosingOptions
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 

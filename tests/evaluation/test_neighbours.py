@@ -9,7 +9,7 @@ import trimesh
 
 from tests.pinch import QUICK, cylinder, pinch, quick_trial
 from torchgrasp import close_hand
-from torchgrasp.errors import MeshError, Status
+from torchgrasp.foundation.errors import MeshError, Status
 from torchgrasp.sim import Neighbour
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
@@ -76,7 +76,7 @@ def test_neighbours_weigh_what_they_are_given_and_are_checked():
     pytest.importorskip("sapien")
     from torchgrasp.evaluation import GraspTrial, Truth
     from torchgrasp.evaluation.trial import TrialDriver
-    from torchgrasp.specs import TrialSpec
+    from torchgrasp.values.specs import TrialSpec
 
     hand, grasp = pinch("allegro")
     around = [Neighbour(box((0.3, 0.3))), Neighbour(box((-0.3, 0.3)), mass=0.5)]

@@ -15,24 +15,33 @@ import trimesh
 import torchgrasp
 from tests.make import real
 from tests.pinch import cylinder, pinch
-from torchgrasp import ContactSpec, Plane, TrialSpec, load_grasps, load_object, plan_grasps
-from torchgrasp.control import ClosingReference, GraspController, Observation
+from torchgrasp import (
+    ClosingReference,
+    ContactSpec,
+    GraspController,
+    Plane,
+    TrialSpec,
+    load_grasps,
+    load_object,
+    plan_grasps,
+)
+from torchgrasp.control import Observation
 from torchgrasp.data.accept import as_cloud
-from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation import EvaluationSpec, GraspTrial, Truth
 from torchgrasp.evaluation.trial import TrialDriver, derive_reference
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Taken
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import read_plane
-from torchgrasp.marks import Taken
 from torchgrasp.sim import Neighbour
-from torchgrasp.sim.scene import Scene
 from torchgrasp.sim.scene_spec import Body, SceneSpec
-from torchgrasp.values import PointCloud
+from torchgrasp.sim.simulated_scene import SimulatedScene
+from torchgrasp.values.planning import PointCloud
 
 TILT = math.radians(2)
 WRONG = Plane(torch.tensor([math.sin(TILT), 0.0, math.cos(TILT)], dtype=torch.float64), 0.003)
 """A table 3 mm too high and tilted by 2 degrees."""
-SECRETS = (Truth, SceneSpec, Body, Neighbour, Scene, GraspTrial, TrialSpec, EvaluationSpec, trimesh.Trimesh)
+SECRETS = (Truth, SceneSpec, Body, Neighbour, SimulatedScene, GraspTrial, TrialSpec, EvaluationSpec, trimesh.Trimesh)
 """The types that hold a part of the truth."""
 
 

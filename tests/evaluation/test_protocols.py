@@ -10,7 +10,6 @@ import torch
 from tests.make import near, real
 from tests.pinch import cylinder, pinch
 from torchgrasp.app.cli.evaluate import Evaluate
-from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.protocols import (
     PROTOCOLS,
     PoseNoise,
@@ -24,6 +23,7 @@ from torchgrasp.evaluation.protocols import (
     find_protocol,
     seed_of,
 )
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
 
 

@@ -9,10 +9,10 @@ import torch
 from tests.make import near, real
 from tests.pinch import cylinder, pinch
 from torchgrasp.control import squeeze
-from torchgrasp.control.forces import joint_stiffness
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.control.finger_forces import joint_stiffness
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, pull_grasp
 from torchgrasp.evaluation.trial import TrialRun
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]

@@ -9,17 +9,17 @@ import torch
 from tests.make import real
 from tests.pinch import QUICK, cylinder, digest, pinch, quick_trial
 from torchgrasp import Plane
-from torchgrasp.closure import ClosingOptions
-from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation import GraspTrial, Protocol, ProtocolResult, PullSpec, Truth, ViewScore, summarise
 from torchgrasp.evaluation.causes import tick_of
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import apply_error
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.regrasp import _left_behind, lift_grasps, list_others, next_grasp
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.values import Contacts, Grasps
+from torchgrasp.values.closing import ClosingOptions
+from torchgrasp.values.planning import Contacts, Grasps
 
 TURNED = real([0.0, 0.0, 1.0])
 

@@ -15,12 +15,12 @@ from torchgrasp import TrialSpec, load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.control import ClosingOptions
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PoseNoise, Protocol, Truth, evaluate, views
 from torchgrasp.evaluation.pull import run_protocol
-from torchgrasp.evaluation.score import STAGES, summarise
+from torchgrasp.evaluation.summary import STAGES, summarise
 from torchgrasp.evaluation.views import EvaluationSpec, choose_rows
 from torchgrasp.files import hold_folder
+from torchgrasp.foundation.errors import BadArgument, Status
 
 FAMILIES = ((0, "round", "solid"), (1, "round", "solid"), (2, "round", "thin"), (3, "wire", "thin"))
 """Row of `SCORES`, family and group."""
@@ -207,7 +207,7 @@ def test_try_grasp_passes_the_surface_to_closings_that_compare_contacts_with_it(
 
     monkeypatch.setattr(views, "run_protocol", run)
     hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
-    view = views.View(folder, "tin", "view0", hand.source)
+    view = views.ObjectView(folder, "tin", "view0", hand.source)
     views.try_grasp(view, grasp, Protocol("quick", TrialSpec(**changes)), EvaluationSpec(1), (0, 0))
     (trial,) = tried
     assert (trial.surface is not None) is known

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchgrasp.evaluation.score import judge
+from torchgrasp.evaluation.summary import judge
 
 UNITS = [f"family_{k % 40}" for k in range(6000)]
 

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from tests.pinch import pinch
 from torchgrasp import Plane
 from torchgrasp.app import cli
-from torchgrasp.errors import BadArgument
 from torchgrasp.export import format_grasps, format_moveit, format_trajectories, read_foreign
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 yaml = pytest.importorskip("yaml")

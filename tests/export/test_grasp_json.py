@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from tests.pinch import pinch
 from torchgrasp import Plane, load_hand
 from torchgrasp.app import cli
-from torchgrasp.control.forces import squeeze
-from torchgrasp.errors import BadArgument
+from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.export import format_grasps, format_keyframes, format_moveit
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 
 HANDS = ["allegro", "barrett"]

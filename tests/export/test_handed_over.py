@@ -13,8 +13,7 @@ from tests.pinch import cylinder, pinch
 from torchgrasp import certify
 from torchgrasp.app import cli
 from torchgrasp.cloud import look_at, partial_view, save_cloud
-from torchgrasp.control.forces import squeeze
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.export import (
     format_graspgen,
     format_grasps,
@@ -24,6 +23,7 @@ from torchgrasp.export import (
     read_foreign,
     save_dexgraspbench,
 )
+from torchgrasp.foundation.errors import BadArgument, Status
 
 yaml = pytest.importorskip("yaml")
 

@@ -21,17 +21,16 @@ import trimesh
 from benchmarks.close.play import LEAST_SAME, PLAYERS, ROOT, play_all
 from scipy.spatial import ConvexHull
 
-from torchgrasp import ContactSpec, fit_shape, load_hand, load_object, plan_grasps
+from torchgrasp import ContactSpec, close_hand, fit_shape, load_hand, load_object, plan_grasps
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument, MeshError, Status
-from torchgrasp.evaluation import close_hand
 from torchgrasp.export import save_play
 from torchgrasp.export.play import pressing_force
+from torchgrasp.foundation.errors import BadArgument, MeshError, Status
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.shape import extract_surface
-from torchgrasp.specs import TrialSpec
+from torchgrasp.values.specs import TrialSpec
 
 OBJECTS, HANDS, MASSES = ("jug", "cylinder", "rabbit", "spray"), ("allegro", "barrett"), (0.25, 4.0)
 """Objects, hands and masses [kg]: the heavy ones are beyond what most joints can press."""

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.make import near, real
-from torchgrasp.errors import DegenerateContacts
+from torchgrasp.foundation.errors import DegenerateContacts
 from torchgrasp.geometry.frames import (
     apply,
     degenerate,

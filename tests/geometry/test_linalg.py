@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.foundation.errors import IndefiniteCovariance
 from torchgrasp.geometry.linalg import (
     cholesky,
     farthest_points,

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchgrasp.errors import MeshError, SuspiciousScale
+from torchgrasp.foundation.errors import MeshError, SuspiciousScale
+from torchgrasp.foundation.limits import MESH_BYTES
 from torchgrasp.geometry.mesh import clip_mesh, closest_on_triangles, read_mesh
-from torchgrasp.limits import MESH_BYTES
 from torchgrasp.sim.convex_parts import check_parts
 
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Batch
+from torchgrasp.foundation.base import Batch
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 
 

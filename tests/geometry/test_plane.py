@@ -5,7 +5,7 @@ import torch
 
 from tests.make import random_motion
 from torchgrasp import ContactSpec, PointCloud, fit_shape
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import GRID, Plane, as_plane, move, round_upright, upright_frame

@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from tests.make import field_of_mesh, real
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.field_batch import FieldBatch
 from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
 from torchgrasp.hand.self_collision import box_distance

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchgrasp import Contacts, ContactSpec, Hand, Plane, PointCloud, ShapeGP, certify, encode, load_hand
-from torchgrasp.base import named_tensors
+from torchgrasp import Contacts, ContactSpec, GraspMixture, Hand, Plane, PointCloud, ShapeGP, certify, encode, load_hand
 from torchgrasp.control import law, squeeze
 from torchgrasp.data.shipped import load_shipped_grasp
+from torchgrasp.foundation.base import named_tensors
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.posture_model import GaussianMixture, GraspMixture
+from torchgrasp.posture_model import GaussianMixture
 from torchgrasp.posture_model.mixture import CODE_NAMES
 from torchgrasp.shape import (
     HollowShape,
@@ -243,7 +243,7 @@ def densities(owner: str, kind: type[GaussianMixture], names: tuple[str, ...]) -
 
 
 ROWS: dict[str, Row] = {
-    "torchgrasp.plan.certify.certify": Row(
+    "torchgrasp.contacts.certify.certify": Row(
         "contacts, for the margin", ONCE, of_contacts(margin), note="by the dual; a subgradient where it is not unique"
     ),
     "torchgrasp.posture_model.mixture.encode": Row("points, normals", TWICE, of_contacts(code)),
@@ -259,7 +259,7 @@ ROWS: dict[str, Row] = {
     f"{GRASP}.modes": Row(
         "codes, parameters", TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.modes(q, 2), 6), note="the k largest"
     ),
-    "torchgrasp.control.forces.squeeze": Row("joints", TWICE, pressed),
+    "torchgrasp.control.finger_forces.squeeze": Row("joints", TWICE, pressed),
     **{
         f"torchgrasp.hand.hand.Hand.{name}": Row("joints", TWICE, of_hand(name), 1)
         for name in "check_joints expand expand_joints fingertips link_poses sphere_centres tip_centres".split()
@@ -329,7 +329,7 @@ ROWS: dict[str, Row] = {
         lambda dtype: ((lambda r: KERNELS["rbf"].derivatives(r, 3)), (draw(4).abs().to(dtype) + 0.1,)),
     ),
     **{
-        f"torchgrasp.shape.values.Normalisation.{name}": Row(
+        f"torchgrasp.shape.estimate.Normalisation.{name}": Row(
             "points", TWICE, of_field(lambda dtype, name=name: getattr(Normalisation(draw(3).to(dtype), 0.05), name)), 1
         )
         for name in ("normalise", "metres")

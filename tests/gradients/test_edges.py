@@ -12,7 +12,7 @@ from tests.make import near, real
 from torchgrasp import Contacts, certify, encode, load_mixture
 from torchgrasp.control import squeeze
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import virtual_frame
 from torchgrasp.geometry.linalg import cholesky, unit
 from torchgrasp.hand.load import load_hand

@@ -18,8 +18,8 @@ from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 from tests.gradients.compare import F64, every, near, scalar, slopes
 from tests.gradients.table import LAW, MASKS, ROWS, Function, Row, draw, outputs, page
 from tests.hostile.arguments import checked_things, required
-from torchgrasp.base import Value, map_tensors, named_tensors
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, map_tensors, named_tensors
+from torchgrasp.foundation.errors import BadArgument
 
 ROOT = Path(__file__).parents[2]
 STEP = 1e-6

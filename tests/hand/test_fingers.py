@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 
-from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand, with_fingers
 
 FINGER = """

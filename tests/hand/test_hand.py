@@ -7,7 +7,7 @@ import torch
 
 from tests.make import near, real
 from torchgrasp import Hand, load_hand
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import largest_fk_error, random_joints

@@ -20,7 +20,7 @@ import torch
 
 from torchgrasp import load_mixture
 from torchgrasp.app.author.draft import draft_hand, new_hand
-from torchgrasp.errors import GraspError, HandFileError, ModelFileError
+from torchgrasp.foundation.errors import GraspError, HandFileError, ModelFileError
 from torchgrasp.hand.load import hands_folder, load_hand
 
 if sys.version_info >= (3, 11):

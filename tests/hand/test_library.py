@@ -13,8 +13,8 @@ from torch.func import hessian, jacfwd, jacrev, vmap
 
 from tests.make import near
 from torchgrasp import Hand, load_hand
-from torchgrasp.base import named_tensors
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import random_joints

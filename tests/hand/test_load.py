@@ -5,7 +5,7 @@ import shutil
 import pytest
 import torch
 
-from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import find_hand, hands_folder, load_hand
 
 

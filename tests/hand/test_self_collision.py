@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchgrasp import Hand, load_hand
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.hand.collision_shapes import MEETING_DISTANCE, collision_pairs, self_collision_from_urdf
 from torchgrasp.hand.hand_toml import read_hand_toml

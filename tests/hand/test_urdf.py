@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from torchgrasp.errors import HandFileError
+from torchgrasp.foundation.errors import HandFileError
+from torchgrasp.foundation.limits import URDF_BYTES
 from torchgrasp.hand.urdf import read_published, read_urdf
-from torchgrasp.limits import URDF_BYTES
 
 LINKS = '<link name="a"/><link name="b"/>'
 JOINT = (

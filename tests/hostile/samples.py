@@ -19,20 +19,20 @@ from typing_extensions import Unpack
 
 import torchgrasp
 from tests.make import see
-from torchgrasp import PointCloud, fit_shape, load_hand, load_object
+from torchgrasp import ClosingReference, GraspController, GraspMixture, PointCloud, fit_shape, load_hand, load_object
 from torchgrasp.arm import Arm
-from torchgrasp.checks import Range
 from torchgrasp.cloud import estimate_normals
-from torchgrasp.control import ClosingReference, GraspController, no_contact, observe
+from torchgrasp.contacts import ShapeLike
+from torchgrasp.control import no_contact, observe
 from torchgrasp.control.paper.closings import Impedance
 from torchgrasp.control.paper.stability import NAMES, StabilityModel
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import Status
+from torchgrasp.foundation.checks import Range
+from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.ik import GraspProblem, PostureLibrary
-from torchgrasp.plan import Shape
 from torchgrasp.planner.explain import Funnel, Losses
-from torchgrasp.posture_model import GaussianMixture, GraspMixture, SampleSpec, write_samples
+from torchgrasp.posture_model import GaussianMixture, SampleSpec, write_samples
 from torchgrasp.posture_model.dataset import SampleFolder
 from torchgrasp.posture_model.mixture import CODE_NAMES
 from torchgrasp.shape import Kernel, thin_plate_kernel
@@ -40,9 +40,9 @@ from torchgrasp.shape.completion.complete import Completion, complete_cloud
 from torchgrasp.shape.completion.silhouette import Outlines, Silhouette, silhouettes
 from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.posterior import Posterior
-from torchgrasp.sim.scene import Scene
 from torchgrasp.sim.simulated_hand import SimulatedHand
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.sim.simulated_scene import SimulatedScene
+from torchgrasp.values.planning import Certificate, Contacts, Grasps
 
 LENGTHS = {"b": 1, "n": 6, "g": 1, "f": 3, "t": 4, "k": 2, "v": 5, "q": 6, "c": 3}
 """Lengths of the letters in samples; others are 4."""
@@ -86,11 +86,11 @@ def special(kind: type) -> Any:
         Silhouette: lambda: special(Outlines).views[0],
         Posterior: lambda: special(torchgrasp.ShapeGP),
         HollowShape: lambda: HollowShape.join(*[special(torchgrasp.ShapeGP)] * 2, special(PointCloud)),
-        Scene: type("Nowhere", (Scene,), {name: nothing for name in ("__init__", *Scene.__abstractmethods__)}),
+        SimulatedScene: type("Nowhere", (SimulatedScene,), {name: nothing for name in ("__init__", *SimulatedScene.__abstractmethods__)}),
         SimulatedHand: simulated_hand,
         torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
         torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
-        Shape: lambda: special(torchgrasp.ShapeGP),
+        ShapeLike: lambda: special(torchgrasp.ShapeGP),
         Kernel: lambda: thin_plate_kernel(2.0),
         GaussianMixture: lambda: GaussianMixture(*mixture),
         GraspMixture: lambda: GraspMixture(*mixture),
@@ -119,7 +119,7 @@ def nothing(*arguments: Any) -> None:
 
 def simulated_hand() -> SimulatedHand:
     """Return a hand whose scene has nothing but names: what a border refuses reaches none."""
-    reference, scene = special(ClosingReference), special(Scene)
+    reference, scene = special(ClosingReference), special(SimulatedScene)
     scene.timestep, scene.joint_names = 0.002, reference.hand.tree.joint_names
     return SimulatedHand(scene, reference, 50.0, None)
 

@@ -11,8 +11,8 @@ from torch.autograd import forward_ad
 import torchgrasp
 from tests.hostile.arguments import HOSTILE, behind, checked_things, methods_of, public, required, wrong_arguments
 from tests.hostile.samples import sample
-from torchgrasp.checks import Count, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.checks import Count, checked
+from torchgrasp.foundation.errors import BadArgument
 
 MADE_INSIDE = {
     "ActuatedJoints", "CollisionSpheres", "Completion", "Components", "Fingertips", "Hand", "HollowShape", "Joint",

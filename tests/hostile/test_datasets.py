@@ -16,10 +16,10 @@ from torchgrasp import PointCloud, load_grasps
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data import list_views, read_entries, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import CloudFileError, DatasetError, MeshError, Status
 from torchgrasp.evaluation import EvaluationSpec, Protocol, evaluate
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore
-from torchgrasp.evaluation.views import View
+from torchgrasp.evaluation.summary import ProtocolResult, ViewScore
+from torchgrasp.evaluation.views import ObjectView
+from torchgrasp.foundation.errors import CloudFileError, DatasetError, MeshError, Status
 from torchgrasp.hand.load import load_hand
 
 POSE = [[1.0, 0.0, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
@@ -169,17 +169,17 @@ def test_two_names_never_share_a_file_of_grasps(tmp_path: Path, monkeypatch: pyt
     view = GOOD["views"]["v0"]
     write(objects, {"a": {"views": {"b_c": view}}, "a_b": {"views": {"c": view}}})
 
-    def plan(view: View, shelf: Path, friction: float, spec: EvaluationSpec) -> ViewScore:
+    def plan(view: ObjectView, shelf: Path, friction: float, spec: EvaluationSpec) -> ViewScore:
         dataclasses.replace(grasps, score=torch.full((1,), float(len(view.object)))).save(view.file(shelf))
         return dataclasses.replace(view.score, executable=1)
 
     def attempt(
-        view: View, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int
+        view: ObjectView, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int
     ) -> ProtocolResult:
         return ProtocolResult(row, draw, True, Status.OK, force=float(load_grasps(view.file(shelf)).score))
 
-    monkeypatch.setattr("torchgrasp.evaluation.run._plan", plan)
-    monkeypatch.setattr("torchgrasp.evaluation.run._try", attempt)
+    monkeypatch.setattr("torchgrasp.evaluation.sweep._plan", plan)
+    monkeypatch.setattr("torchgrasp.evaluation.sweep._try", attempt)
     scores = list(evaluate(objects, load_hand("barrett"), spec=EvaluationSpec(1), folder=tmp_path / "grasps"))
     written = sorted(str(x.relative_to(tmp_path / "grasps")) for x in (tmp_path / "grasps").rglob("*.safetensors"))
     assert written == ["a/b_c.safetensors", "a_b/c.safetensors"]

@@ -12,13 +12,13 @@ from safetensors.torch import save_file
 
 from torchgrasp import load_grasps, load_object, plan_grasps
 from torchgrasp.app import cli
-from torchgrasp.base import named_tensors
 from torchgrasp.cloud.read import read_cloud
-from torchgrasp.errors import BadArgument, ModelFileError
+from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import BadArgument, ModelFileError
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.load import load_hand
 from torchgrasp.scene.file import read_scene
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 
 @pytest.fixture(scope="module")

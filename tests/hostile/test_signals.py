@@ -62,7 +62,7 @@ import os, sys, time
 from collections.abc import Callable
 from pathlib import Path
 from torchgrasp.files import hold_folder
-from torchgrasp.jobs import run_tasks
+from torchgrasp.foundation.jobs import run_tasks
 
 def tell_and_sleep(path):
     Path(path + ".part").write_text(str(os.getpid()))

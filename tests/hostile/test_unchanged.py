@@ -20,10 +20,10 @@ from tests.hostile.samples import hints_of
 from tests.hostile.unchanged import changes
 from tests.make import run_python
 from tests.pinch import QUICK
-from torchgrasp.base import Value
-from torchgrasp.checks import Count
-from torchgrasp.closure import ClosingOptions
-from torchgrasp.specs import TrialSpec
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Count
+from torchgrasp.values.closing import ClosingOptions
+from torchgrasp.values.specs import TrialSpec
 
 IMPORTED = "sympy", "sapien"
 """Packages of others that are imported late, and leave a filter of warnings and variables of the environment."""

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from tests.make import field_of_mesh, real
 from torchgrasp import load_hand, load_mixture
-from torchgrasp.base import Batch, rank_in_group
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.base import Batch, rank_in_group
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply
 from torchgrasp.ik import CollisionWorld, GraspProblem
 from torchgrasp.ik.attempts import Attempts, assign, solve_contact_first
 from torchgrasp.ik.seeds import query_mixture
-from torchgrasp.values import Certificate, Contacts, IKSeeds
+from torchgrasp.values.planning import Certificate, Contacts, IKSeeds
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from torchgrasp import Status, certify
+from torchgrasp.contacts.feasibility import flatness_constraint
+from torchgrasp.contacts.problem import ContactProblem, triple_jet
+from torchgrasp.contacts.solver import normalise_tensions
 from torchgrasp.geometry.frames import apply
 from torchgrasp.ik.attempts import assign, solve_contact_first
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.joint import JointProblem, JointState, solve_joint
 from torchgrasp.ik.seeds import nearest_postures
-from torchgrasp.plan.feasibility import flatness_constraint
-from torchgrasp.plan.problem import ContactProblem, triple_jet
-from torchgrasp.plan.solver import normalise_tensions
 
 
 @pytest.fixture(scope="module", params=[3, 4])

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.make import near, real
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.ik import Obstacles

@@ -5,9 +5,9 @@ import math
 import torch
 
 from tests.make import near, real, spokes
-from torchgrasp.base import rank_in_group
+from torchgrasp.foundation.base import rank_in_group
 from torchgrasp.ik.candidates import centred_friction
-from torchgrasp.values import Contacts
+from torchgrasp.values.planning import Contacts
 
 
 def test_rank_in_group_against_brute_force(generator):

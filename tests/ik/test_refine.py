@@ -7,7 +7,7 @@ import torch
 
 from tests.make import near, real, touched_contacts
 from torchgrasp import Contacts, Plane, load_hand
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.candidates import is_clear, measure_errors

@@ -9,7 +9,7 @@ import torch
 
 from tests.make import near, real, touched_contacts
 from torchgrasp import Contacts, Hand, fit_mixture, load_hand
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, collision_cost

@@ -5,7 +5,7 @@ import torch
 
 from tests.make import near, real, touched_contacts
 from torchgrasp import Contacts, load_hand, load_mixture, sample_configurations, solve_ik
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
 from torchgrasp.ik import CollisionWorld, PostureLibrary
 from torchgrasp.ik.attempts import refine_by_cobyla

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.errors import BrokenLaw
+from torchgrasp.foundation.errors import BrokenLaw
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.kernel import NEAR_ZERO, Kernel, differentiate, gram
 

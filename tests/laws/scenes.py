@@ -6,14 +6,14 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from torchgrasp.errors import BrokenLaw
+from torchgrasp.foundation.errors import BrokenLaw
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.sim.scene import STILL, Scene
 from torchgrasp.sim.scene_spec import SceneSpec
+from torchgrasp.sim.simulated_scene import STILL, SimulatedScene
 
-Open = Callable[[SceneSpec], Scene]
+Open = Callable[[SceneSpec], SimulatedScene]
 """Opens a fresh scene, as `open_scene` and a class of scenes do."""
 
 RADIUS, HEIGHT, FOOT, MASS = 0.03, 0.12, 0.2, 0.36
@@ -25,7 +25,7 @@ POSE, MOVED = 1e-4, 5e-4
 
 
 def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
-    """Check a simulator of your own: every call of `open_scene` returns a fresh `Scene` of a `SceneSpec`.
+    """Check a simulator of your own: every call of `open_scene` returns a fresh `SimulatedScene` of a `SceneSpec`.
 
     The laws, by the name that an error gives them:
 
@@ -72,11 +72,11 @@ class _Laws:
     spec: SceneSpec
     hand: Hand
 
-    def scene(self, **changes: object) -> Scene:
+    def scene(self, **changes: object) -> SimulatedScene:
         """Return a fresh scene of the specification but for some changes."""
         scene = self.open_scene(dataclasses.replace(self.spec, **changes))  # pyright: ignore[reportArgumentType]
-        if not isinstance(scene, Scene):
-            raise BrokenLaw("scene", type(scene).__name__, "a torchgrasp.sim.Scene")
+        if not isinstance(scene, SimulatedScene):
+            raise BrokenLaw("scene", type(scene).__name__, "a torchgrasp.sim.SimulatedScene")
         return scene
 
     def check_start(self) -> None:

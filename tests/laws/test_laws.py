@@ -24,11 +24,11 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.cloud import look_at, partial_view
-from torchgrasp.errors import CloudWarning, Status
+from torchgrasp.foundation.errors import CloudWarning, Status
 from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.shape.estimate import Normalisation, Observations
 from torchgrasp.shape.fit import condition
-from torchgrasp.shape.values import Normalisation, Observations
-from torchgrasp.values import Contacts
+from torchgrasp.values.planning import Contacts
 
 
 def transformed(contacts: Contacts, motion: torch.Tensor, scale: float = 1.0) -> Contacts:

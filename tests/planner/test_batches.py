@@ -10,14 +10,14 @@ import trimesh
 
 from tests.make import load_hand, real, same_bits
 from torchgrasp import ContactSpec, Status, load_object, plan_grasps, stream_grasps
-from torchgrasp.base import join
 from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.errors import BadArgument
+from torchgrasp.contacts.certify import certify
+from torchgrasp.foundation.base import join
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid
-from torchgrasp.plan.certify import certify
 from torchgrasp.planner.contacts import LIKELY, WEAK, Pool, SeededContacts
 from torchgrasp.planner.schedule import FIRST, schedule
-from torchgrasp.values import Certificate, Contacts, IKSeeds
+from torchgrasp.values.planning import Certificate, Contacts, IKSeeds
 
 SPEC = ContactSpec(table=0.0)
 HAND, VIEW = load_hand("barrett"), load_object("cylinder").view

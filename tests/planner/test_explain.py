@@ -14,7 +14,7 @@ from torchgrasp.planner.batches import Planner
 from torchgrasp.planner.changes import list_changes
 from torchgrasp.planner.explain import Funnel, Losses, order_changes
 from torchgrasp.planner.request import Request
-from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
+from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
 
 TABLE = ContactSpec(table=0.0)
 VIEW = load_object("cylinder").view

@@ -23,8 +23,8 @@ from torchgrasp import (
 )
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import DATA
-from torchgrasp.errors import BadArgument
 from torchgrasp.export import format_grasps
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand import hand_of
 from torchgrasp.planner.request import finger_sets

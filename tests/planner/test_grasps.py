@@ -20,18 +20,18 @@ from torchgrasp import (
     plan_grasps,
     stream_grasps,
 )
-from torchgrasp.base import named_tensors
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.planner.contacts import spread_rows
 from torchgrasp.planner.problem import digest
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, encode_fingertips, load_mixture
-from torchgrasp.success.explain import measure_again
-from torchgrasp.success.model import load_model
+from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import by_success, grade
 from torchgrasp.success.promise import Promise
+from torchgrasp.success.reasons import measure_again
 
 SPEC = ContactSpec(table=0.0)
 VIEW = load_object("cylinder").view
@@ -78,9 +78,9 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
 def test_success_is_what_the_model_says_of_the_features_that_an_explanation_measures_again(run):
     hand, grasps, stages = run
     best = grasps[grasps.status == Status.OK][:5]
-    odds = load_model().log_odds(measure_again(best, hand, stages["shape"], GraspTask()))
+    odds = load_success_model().log_odds(measure_again(best, hand, stages["shape"], GraspTask()))
     torch.testing.assert_close(best.success, torch.sigmoid(odds), rtol=1e-6, atol=1e-6)
-    near(best.interval, load_model().interval(odds), 1e-6)
+    near(best.interval, load_success_model().interval(odds), 1e-6)
 
 
 @pytest.mark.parametrize("task", [GraspTask(mass=0.02, force=8.0, lift=False), GraspTask(mass=0.9)])
@@ -89,7 +89,7 @@ def test_a_task_changes_the_predictions_and_not_the_grasps(task):
     note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731
     grasps = plan_grasps(VIEW, hand, SPEC, starts=12, task=task, observer=note)
     best = grasps[grasps.status == Status.OK]
-    odds = load_model().log_odds(measure_again(best, hand, shapes[0], task))
+    odds = load_success_model().log_odds(measure_again(best, hand, shapes[0], task))
     near(best.score, odds, 1e-6)
     assert grasps.meta["task"] == task.describe() != usual().meta["task"]
     first, second = (set(map(tuple, found[found.status == Status.OK].joints.tolist())) for found in (usual(), grasps))
@@ -201,7 +201,7 @@ def test_no_triples_is_an_answer_and_spread_rows_are_far_apart():
     assert len(spread_rows(plan, 100)) == 49
 
 
-@pytest.mark.filterwarnings("ignore::torchgrasp.errors.CloudWarning")
+@pytest.mark.filterwarnings("ignore::torchgrasp.foundation.errors.CloudWarning")
 @pytest.mark.parametrize("rows", [slice(0, 20), slice(0, None)])
 def test_success_is_unknown_where_the_cloud_has_few_points_or_one_flat_face(rows):
     draw = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5

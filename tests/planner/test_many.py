@@ -5,7 +5,7 @@ import torch
 
 from tests.make import cup_view, load_hand, same_bits
 from torchgrasp import ContactSpec, GraspTask, PointCloud, Status, load_object, plan_grasps
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
 from torchgrasp.planner.request import Request

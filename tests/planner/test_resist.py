@@ -5,12 +5,12 @@ import json
 import pytest
 import torch
 
+from tests.contacts.test_resist import by_highs
 from tests.make import directions, load_hand, random_motion, real, same_bits
-from tests.plan.test_resist import by_highs
 from torchgrasp import ContactSpec, GraspTask, Status, explain_empty, load_grasps, load_object, plan_grasps
 from torchgrasp.app.report.page import grasp_columns, grasp_rows
-from torchgrasp.errors import BadArgument
 from torchgrasp.export import format_grasps
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.attempts import assign

@@ -7,7 +7,7 @@ import torch
 
 from tests.make import load_hand, near, see
 from torchgrasp import ContactSpec, Status, load_scene, plan_grasps, plan_scene
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.planner.graspable import order_by_ease

@@ -5,7 +5,7 @@ import torch
 
 from tests.make import load_hand, random_motion, see
 from torchgrasp import ContactSpec, Region, Status, explain_empty, load_object, plan_grasps, plan_scene
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.plane import Plane, move
 

@@ -9,11 +9,11 @@ import torch
 from tests.make import ring_samples as ring
 from tests.make import run_python
 from torchgrasp import GraspMixture, load_mixture
-from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import load_tensors
-from torchgrasp.posture_model.em import Progress, Shard
-from torchgrasp.posture_model.fit import Checkpoint, fit_mixture
+from torchgrasp.foundation.errors import BadArgument, ModelFileError, OutputError
+from torchgrasp.posture_model.em import DataRows, FitProgress
 from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.posture_model.training import Checkpoint, fit_mixture
 
 
 def parameters(mixture: GraspMixture) -> torch.Tensor:
@@ -26,9 +26,9 @@ class Killed(Exception):
 
 def fit_until(step: int, path: Path, samples: HandSamples) -> None:
     """Fit with a checkpoint and be killed after so many steps of this run."""
-    steps: list[Progress] = []
+    steps: list[FitProgress] = []
 
-    def kill(progress: Progress) -> None:
+    def kill(progress: FitProgress) -> None:
         steps.append(progress)
         if len(steps) == step:
             raise Killed
@@ -43,7 +43,7 @@ def test_a_fit_goes_on_where_it_was_killed(tmp_path):
     whole = fit_mixture(samples, 5, iterations=20, tolerance=0.0)
     for step in (1, 3, 8):  # killed three times
         fit_until(step, path, samples)
-    steps: list[Progress] = []
+    steps: list[FitProgress] = []
     again = fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path, observer=steps.append)
     assert len(steps) == 20 - (1 + 3 + 8)
     assert torch.equal(parameters(again), parameters(whole))
@@ -86,7 +86,7 @@ def test_two_processes_fit_what_one_does(tmp_path):
     script.write_text(f"""
 import torch
 from tests.make import ring_samples as ring
-from torchgrasp.posture_model.fit import fit_mixture
+from torchgrasp.posture_model.training import fit_mixture
 torch.distributed.init_process_group("gloo")
 rank = torch.distributed.get_rank()
 share = ring()[:1100] if rank == 0 else ring()[1100:]  # unequal shares
@@ -111,7 +111,7 @@ torch.distributed.destroy_process_group()
     assert longer.meta["iterations"] == "30"
 
 
-class OtherProcesses(Shard):
+class OtherProcesses(DataRows):
     """A shard beside two others, whose checkpoints stand at 1 and at 3 steps."""
 
     def sum(self, x):
@@ -124,7 +124,7 @@ def test_processes_whose_checkpoints_differ_are_all_refused_and_no_group_is_name
     shapes = {"weights", "means", "covariances", "reseeded", "log_likelihood", "centre", "scale"}
     tensors, meta = load_tensors(path, "em", shapes)
     settings = {name: meta[name] for name in ("rows", "components", "seed", "starts", "regularisation")}
-    alone = Checkpoint(path, Shard(ring().rows()), tensors["centre"], tensors["scale"], settings)
+    alone = Checkpoint(path, DataRows(ring().rows()), tensors["centre"], tensors["scale"], settings)
     progress = alone.load()
     assert progress is not None and len(progress.log_likelihood) == 2 == int(mixture.meta["iterations"])
     with pytest.raises(BadArgument, match="some processes see"):  # although 2 steps are the mean of 1, 2 and 3

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchgrasp import load_hand
+from torchgrasp import load_hand, sample_configurations
 from torchgrasp.app.cli import main
-from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import hold_folder
-from torchgrasp.posture_model import SampleSpec, load_samples, sample_configurations, write_samples
+from torchgrasp.foundation.errors import BadArgument, ModelFileError, OutputError
+from torchgrasp.posture_model import SampleSpec, load_samples, write_samples
 
 
 @pytest.fixture

@@ -8,12 +8,12 @@ import torch
 from sklearn.mixture import GaussianMixture
 
 from tests.make import near, real
-from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.posture_model.em import (
     MAX_RESEEDS,
     Components,
-    Progress,
-    Shard,
+    DataRows,
+    FitProgress,
     coefficients_from_components,
     components_from_sums,
     expectation,
@@ -55,8 +55,8 @@ def test_eq19_features_give_the_gaussian_density_and_eq20_one_component_the_samp
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_eq20_em_equals_scikit_learn_from_the_same_start():
     x, m, steps = clustered(), 6, 15
-    start = start_components(Shard(x), m, seed=0, regularisation=1e-6)
-    ours = expectation_maximisation(Shard(x), start, steps, tolerance=0.0, regularisation=1e-6)
+    start = start_components(DataRows(x), m, seed=0, regularisation=1e-6)
+    ours = expectation_maximisation(DataRows(x), start, steps, tolerance=0.0, regularisation=1e-6)
     first = start.components
     theirs = GaussianMixture(
         m,
@@ -78,63 +78,65 @@ def test_eq20_em_equals_scikit_learn_from_the_same_start():
 def test_log_likelihood_never_decreases(m):
     x = clustered()
     fit = expectation_maximisation(
-        Shard(x), start_components(Shard(x), m, 1, 1e-6), 60, tolerance=0.0, regularisation=1e-6
+        DataRows(x), start_components(DataRows(x), m, 1, 1e-6), 60, tolerance=0.0, regularisation=1e-6
     )
     assert float(fit.log_likelihood.diff().min()) >= -1e-9
     # The last entry belongs to the components that are returned.
-    _, log_likelihood = expectation(Shard(x), fit.components)
+    _, log_likelihood = expectation(DataRows(x), fit.components)
     torch.testing.assert_close(log_likelihood / len(x), fit.log_likelihood[-1])
 
 
 def test_start_finds_separate_clusters_by_the_seed_and_names_fewer_rows_than_components(generator):
     x = clustered()
-    first, second = (start_components(Shard(x), 5, 7, 1e-6) for _ in range(2))
+    first, second = (start_components(DataRows(x), 5, 7, 1e-6) for _ in range(2))
     assert torch.equal(first.components.means, second.components.means)
-    assert not torch.equal(first.components.means, start_components(Shard(x), 5, 8, 1e-6).components.means)
+    assert not torch.equal(first.components.means, start_components(DataRows(x), 5, 8, 1e-6).components.means)
     centres = real([[-2.0, 0], [2, 0], [0, 3]])
     x = (centres[:, None] + 0.05 * torch.randn(3, 200, 2, generator=generator, dtype=torch.float64)).flatten(0, 1)
-    start = start_components(Shard(x), 3, 0, 0.0).components
+    start = start_components(DataRows(x), 3, 0, 0.0).components
     torch.testing.assert_close(start.weights, torch.full((3,), 1 / 3, dtype=torch.float64))
     assert float(torch.cdist(centres, start.means).amin(1).max()) < 0.02
     rows = real([[0.0, 1.0], [1.0, 0.0]]).repeat(50, 1)
     with pytest.raises(BadArgument, match=r"components: expected at most 2, .*got 3"):
-        start_components(Shard(rows), 3, 0, 1e-6)
+        start_components(DataRows(rows), 3, 0, 1e-6)
 
 
 def test_an_indefinite_start_and_data_that_span_no_covariance_are_errors():
     x = clustered()
-    start = start_components(Shard(x), 3, 0, 1e-6)
+    start = start_components(DataRows(x), 3, 0, 1e-6)
     flat = start.components.covariances * torch.tensor([1.0, 1, 0])[:, None, None]
     components = Components(start.components.weights, start.components.means, flat)
     with pytest.raises(IndefiniteCovariance, match="fewer components"):
-        expectation_maximisation(Shard(x), Progress(components, start.reseeded, start.log_likelihood), 5, 0.0, 0.0)
+        expectation_maximisation(
+            DataRows(x), FitProgress(components, start.reseeded, start.log_likelihood), 5, 0.0, 0.0
+        )
     x = torch.cat([x, x[:, :1]], 1)  # a column twice
     with pytest.raises(IndefiniteCovariance, match="collapsed 1 times"):
-        start_components(Shard(x), 3, 0, 0.0)
+        start_components(DataRows(x), 3, 0, 0.0)
 
 
 def test_a_collapsed_component_is_placed_anew_and_the_fit_recovers():
     x = clustered()
-    start = start_components(Shard(x), 3, 0, 1e-6)
+    start = start_components(DataRows(x), 3, 0, 1e-6)
     # A component so far away that no row belongs to it: it takes half of the heaviest one.
     means = start.components.means.index_fill(0, torch.tensor([1]), 50.0)
-    lost = Progress(dataclasses.replace(start.components, means=means), start.reseeded, start.log_likelihood)
-    steps: list[Progress] = []
-    fit = expectation_maximisation(Shard(x), lost, 200, 1e-6, 1e-6, observer=steps.append)
+    lost = FitProgress(dataclasses.replace(start.components, means=means), start.reseeded, start.log_likelihood)
+    steps: list[FitProgress] = []
+    fit = expectation_maximisation(DataRows(x), lost, 200, 1e-6, 1e-6, observer=steps.append)
     assert fit.reseeded.tolist() == [0, 1, 0]
     assert [step.jumped for step in steps[:2]] == [True, False]
     assert fit.converged
     assert float(fit.components.weights.min()) > 0.05
     assert float(fit.log_likelihood[1:].diff().min()) >= -1e-9
-    usual = expectation_maximisation(Shard(x), start, 200, 1e-6, 1e-6)
+    usual = expectation_maximisation(DataRows(x), start, 200, 1e-6, 1e-6)
     assert abs(float(fit.log_likelihood[-1] - usual.log_likelihood[-1])) < 0.05
 
 
 @pytest.mark.promise("I11")
 def test_a_component_is_placed_anew_three_times_and_no_more():
     x = clustered()
-    components = start_components(Shard(x), 3, 0, 1e-6).components
-    sums, _ = expectation(Shard(x), components)
+    components = start_components(DataRows(x), 3, 0, 1e-6).components
+    sums, _ = expectation(DataRows(x), components)
     sums[2] = 0.0
     for before in range(MAX_RESEEDS):
         result, reseeded = maximisation(sums, len(x), 0.0, torch.tensor([0, 0, before]))

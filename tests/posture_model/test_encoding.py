@@ -8,7 +8,7 @@ import torch
 
 from tests.make import near, real
 from torchgrasp import Contacts
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rotate, virtual_frame
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.posture_model.mixture import PERMUTATIONS, encode, encode_fingertips

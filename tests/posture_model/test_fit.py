@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchgrasp.errors import BadArgument
-from torchgrasp.posture_model.fit import TRIAL_STEPS, fit_mixture
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model.sample import HandSamples
+from torchgrasp.posture_model.training import TRIAL_STEPS, fit_mixture
 
 
 def banana(n: int = 4000, unit: float = 1.0) -> HandSamples:

@@ -9,7 +9,7 @@ import scipy.stats
 import torch
 from sklearn.mixture import GaussianMixture as Peer
 
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model.gaussian import GaussianMixture
 
 NAMES = ("a", "b", "c", "d")

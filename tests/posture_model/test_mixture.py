@@ -8,8 +8,8 @@ import torch
 from safetensors.torch import save_file
 from scipy.stats import chi2
 
-from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import save_tensors
+from torchgrasp.foundation.errors import BadArgument, ModelFileError
 from torchgrasp.posture_model.mixture import CODE_NAMES, DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
 
 NAMES = ("a", "b", *CODE_NAMES)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchgrasp import load_hand, sample_configurations
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model.mixture import encode_fingertips
 
 

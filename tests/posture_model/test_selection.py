@@ -9,7 +9,7 @@ from paper.bic import bic_curve
 from paper.cross_validation import cross_validate
 
 from torchgrasp import fit_mixture
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model import DEFAULT_ENERGY, PAPER_ENERGY, HandSamples
 from torchgrasp.posture_model.score import evaluate_mixture, growing_bic
 

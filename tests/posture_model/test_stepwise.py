@@ -11,9 +11,9 @@ from sklearn.mixture import GaussianMixture
 
 from tests.make import ring_samples as ring
 from torchgrasp import GraspMixture, fit_mixture
-from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
-from torchgrasp.posture_model.em import Progress, Shard
+from torchgrasp.foundation.errors import BadArgument, ModelFileError
+from torchgrasp.posture_model.em import DataRows, FitProgress
 from torchgrasp.posture_model.stepwise import Subsets, halves
 
 STATE = {"weights", "means", "covariances", "reseeded", "log_likelihood", "centre", "scale"}
@@ -21,7 +21,7 @@ STATE = {"weights", "means", "covariances", "reseeded", "log_likelihood", "centr
 
 
 @dataclasses.dataclass(frozen=True)
-class Part(Shard):
+class Part(DataRows):
     """The share of one process, which knows the lengths of all shares."""
 
     all_lengths: tuple[int, ...] = ()
@@ -39,7 +39,7 @@ def parameters(mixture: GraspMixture) -> torch.Tensor:
 
 def test_subsets_are_nested_random_and_the_same_for_any_number_of_processes():
     x = torch.arange(1000.0, dtype=torch.float64)[:, None]
-    whole = Subsets.of(Shard(x), 100, seed=3)
+    whole = Subsets.of(DataRows(x), 100, seed=3)
     assert whole.sizes == (125, 250, 500, 1000) == tuple(sorted(halves(1000)[:4]))
     found = [whole.take(size).rows[:, 0] for size in whole.sizes]
     assert [len(rows) for rows in found] == list(whole.sizes)
@@ -47,12 +47,12 @@ def test_subsets_are_nested_random_and_the_same_for_any_number_of_processes():
         assert bool(torch.isin(small, large).all())
     # The mean of a random subset deviates by its standard error, not with the order of the rows.
     assert abs(float(found[2].mean()) - 499.5) < 4 * 1000 / (12 * 500) ** 0.5
-    assert not torch.equal(found[0], Subsets.of(Shard(x), 100, seed=4).take(125).rows[:, 0])
+    assert not torch.equal(found[0], Subsets.of(DataRows(x), 100, seed=4).take(125).rows[:, 0])
     lengths = (10, 690, 300)
     parts = [Part(rows, k, 3, lengths) for k, rows in enumerate(x.split(lengths))]
     for size, rows in zip(whole.sizes, found, strict=True):
         assert torch.equal(torch.cat([Subsets.of(part, 100, 3).take(size).rows[:, 0] for part in parts]), rows)
-    assert Subsets.of(Shard(x), None, 0).sizes == Subsets.of(Shard(x), 501, 0).sizes == (1000,)
+    assert Subsets.of(DataRows(x), None, 0).sizes == Subsets.of(DataRows(x), 501, 0).sizes == (1000,)
 
 
 def test_eq20_a_fit_by_subsets_is_a_fixed_point_of_scikit_learn_and_as_likely_as_full_batch_em():
@@ -95,7 +95,7 @@ def test_the_seed_alone_decides_a_fit_and_half_of_the_rows_or_more_are_full_batc
 def test_a_fit_by_subsets_goes_on_where_it_was_killed(tmp_path):
     samples, path = ring(), tmp_path / "fit.safetensors"
     fit = {"tolerance": 1e-3, "subset": 200, "starts": 2}
-    steps: list[Progress] = []
+    steps: list[FitProgress] = []
     whole = fit_mixture(samples, 5, observer=steps.append, **fit)
     rows = [step.rows for step in steps]
     assert rows == sorted(rows) and rows[-1] == 3000 and len(set(rows)) > 1
@@ -104,7 +104,7 @@ def test_a_fit_by_subsets_goes_on_where_it_was_killed(tmp_path):
         path.unlink(missing_ok=True)
         _kill_after(stop, samples, path, fit)
         assert load_tensors(path, "em", STATE)[1]["step_rows"] == str(rows[stop - 1])
-        more: list[Progress] = []
+        more: list[FitProgress] = []
         again = fit_mixture(samples, 5, checkpoint=path, observer=more.append, **fit)
         assert [step.rows for step in more] == rows[stop:]
         assert torch.equal(parameters(again), parameters(whole)) and again.meta == whole.meta
@@ -116,9 +116,9 @@ def test_a_fit_by_subsets_goes_on_where_it_was_killed(tmp_path):
 
 def _kill_after(stop: int, samples, path: Path, fit) -> None:
     """Fit with a checkpoint, and be killed after so many steps."""
-    steps: list[Progress] = []
+    steps: list[FitProgress] = []
 
-    def kill(progress: Progress) -> None:
+    def kill(progress: FitProgress) -> None:
         steps.append(progress)
         if len(steps) == stop:
             raise KeyboardInterrupt

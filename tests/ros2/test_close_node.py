@@ -12,7 +12,7 @@ from tests.ros2 import bags
 from torchgrasp.control import Targets
 from torchgrasp.evaluation import lift
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
-from torchgrasp.specs import TrialSpec
+from torchgrasp.values.specs import TrialSpec
 
 
 @pytest.fixture

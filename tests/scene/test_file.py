@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from torchgrasp import load_scene, read_scene, save_scene
-from torchgrasp.base import named_tensors
-from torchgrasp.errors import BadArgument, CloudFileError
+from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import BadArgument, CloudFileError
 from torchgrasp.scene.image import is_scene
 
 

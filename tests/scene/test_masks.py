@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from tests.make import box
+from torchgrasp import Scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
-from torchgrasp.errors import BadArgument
-from torchgrasp.scene import Scene
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.scene.masks import read_labels, read_mask
 
 LABELS = np.array([[0, 0, 2, 2], [1, 1, 0, 2], [1, 0, 0, 0]])

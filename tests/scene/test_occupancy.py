@@ -7,11 +7,12 @@ import pytest
 import torch
 import trimesh
 
+from torchgrasp import Scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.scene import Scene, estimate_occupancy
+from torchgrasp.scene import estimate_occupancy
 from torchgrasp.scene.image import DepthImage
 
 BOXES = {  # size and position of the lower face's middle

@@ -4,12 +4,12 @@ import torch
 import trimesh
 
 from tests.make import box
+from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
-from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.scene import Scene, read_scene, save_scene
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 POSE = look_at(20.0, 45.0, 0.6)
 K = INTRINSICS

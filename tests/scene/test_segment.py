@@ -7,11 +7,11 @@ import trimesh
 from tests.make import box
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import Support
+from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.merge import find_touching, merge_pieces
-from torchgrasp.scene.segment import on_surface, segment
+from torchgrasp.scene.segment import rests_on, segment
 
 TABLE = Plane.horizontal(0.0)
 
@@ -43,7 +43,7 @@ def look(meshes, elevation=40.0, noise=True):
 )
 def test_each_thing_has_one_label(meshes, elevation):
     image, labels = look(meshes, elevation)
-    found = segment(image, Support(TABLE))
+    found = segment(image, SupportPlane(TABLE))
     assert found.max() == len(meshes)
     for k in range(1, len(meshes) + 1):
         mine = (labels == k) & (image.depth > 0)
@@ -54,20 +54,20 @@ def test_each_thing_has_one_label(meshes, elevation):
 
 def test_an_empty_table_has_no_things():
     image, _ = look([box([0.01, 0.01, 0.01], [0.0, 0.0, -0.1])])
-    assert not segment(image, Support(TABLE)).any()
+    assert not segment(image, SupportPlane(TABLE)).any()
 
 
 def test_flying_pixels_belong_to_nothing():
     image, labels = look([box([0.06, 0.06, 0.1], [0, 0, 0.05])], noise=False)
     row, column = torch.nonzero(labels == 1)[:, 0].min(), 320
-    exact = on_surface(image, TABLE)
+    exact = rests_on(image, TABLE)
     assert (exact & (labels == 1)).sum() > 0.96 * (labels == 1).sum()
     flying = image.depth.clone()
     away = 0.015 + 0.06 * torch.rand(2, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     flying[row - 2 : row, column - 20 : column + 20] = image.depth[row + 3, column] + away
     moved = DepthImage(flying, image.intrinsics, image.obj_from_camera)
-    assert not on_surface(moved, TABLE)[row - 2 : row, column - 20 : column + 20].any()
-    assert segment(moved, Support(TABLE)).max() == 1
+    assert not rests_on(moved, TABLE)[row - 2 : row, column - 20 : column + 20].any()
+    assert segment(moved, SupportPlane(TABLE)).max() == 1
 
 
 def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
@@ -76,8 +76,8 @@ def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
     pan, labels = look([trimesh.util.concatenate([rim, floor])], 60.0)
     ring, _ = look([rim], 60.0)
     inside = (pan.points()[..., :2].norm(dim=-1) < 0.07) & (labels == 1)
-    assert (segment(pan, Support(TABLE))[inside & (pan.depth > 0)] == 1).double().mean() > 0.95
-    assert (segment(ring, Support(TABLE))[inside & (ring.depth > 0)] == 0).double().mean() > 0.95
+    assert (segment(pan, SupportPlane(TABLE))[inside & (pan.depth > 0)] == 1).double().mean() > 0.95
+    assert (segment(ring, SupportPlane(TABLE))[inside & (ring.depth > 0)] == 0).double().mean() > 0.95
 
 
 def torus(major, minor, place, turn=0.0):
@@ -95,7 +95,7 @@ def test_a_mug_with_its_handle_and_a_standing_ring_are_one(elevation, turn):
     mug.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
     for meshes in ([mug], [torus(0.05, 0.01, [0, 0, 0.06], turn)]):
         image, _ = look(meshes, elevation)
-        assert segment(image, Support(TABLE)).max() == 1
+        assert segment(image, SupportPlane(TABLE)).max() == 1
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_mug_with_its_handle_and_a_standing_ring_are_one(elevation, turn):
 )
 def test_objects_that_touch_are_cut_at_the_crease_and_told(meshes):
     image, labels = look(meshes, 45.0)
-    found = segment(image, Support(TABLE))
+    found = segment(image, SupportPlane(TABLE))
     assert found.max() == 2
     for k in (1, 2):
         mine = found[(labels == k) & (found > 0)]
@@ -121,7 +121,7 @@ def test_objects_that_touch_are_cut_at_the_crease_and_told(meshes):
 
 def test_objects_apart_do_not_touch_and_a_convex_surface_has_no_crease():
     image, _ = look([box([0.05, 0.05, 0.06], [0, -0.05, 0.03]), box([0.05, 0.05, 0.06], [0, 0.05, 0.03])], 45.0)
-    found = segment(image, Support(TABLE))
+    found = segment(image, SupportPlane(TABLE))
     assert found.max() == 2 and find_touching(image, found) == []
     assert torch.equal(cut_creases(image, found), found)
 
@@ -131,7 +131,7 @@ def test_an_uneven_place_of_the_table_is_no_object():
     place = image.points()[..., :2]
     rise = 0.0038 * torch.exp(-((place - torch.tensor([0.0, -0.05])) / 0.02).square().sum(-1))
     depth = torch.where(image.depth > 0, image.depth - rise / math.sin(math.radians(45.0)), 0.0)
-    found = segment(DepthImage(depth, image.intrinsics, image.obj_from_camera), Support(TABLE))
+    found = segment(DepthImage(depth, image.intrinsics, image.obj_from_camera), SupportPlane(TABLE))
     assert found.max() == 1
 
 

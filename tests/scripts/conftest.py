@@ -11,9 +11,9 @@ import trimesh
 from paper import trials
 
 from tests.pinch import pinch
-from torchgrasp.base import join
-from torchgrasp.closure import ObjectMotion
-from torchgrasp.errors import Status
+from torchgrasp.foundation.base import join
+from torchgrasp.foundation.errors import Status
+from torchgrasp.values.closing import ObjectMotion
 
 
 @pytest.fixture(autouse=True)

@@ -31,9 +31,9 @@ from train.bodies import COUNTS, author_body
 from tests.make import cup, cup_view
 from tests.pinch import cylinder, pinch
 from torchgrasp import Contacts, ContactSpec, PointCloud, certify, fit_shape, load_object
+from torchgrasp.contacts.form_closure import solve_closure_lp, wrenches
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.closure import solve_closure_lp, wrenches
 
 RUNS = (
     "gpu/launches",

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.common import ROOT, Options
 from claims import measured, run, table
 
-from torchgrasp import ContactSpec, TrialSpec, limits, load_hand
+from torchgrasp import ContactSpec, TrialSpec, load_hand
 from torchgrasp.app.cli import COMMANDS
 from torchgrasp.app.cli.inputs import MOST_POINTS
 from torchgrasp.cloud.check import FEW_POINTS
@@ -18,11 +18,12 @@ from torchgrasp.cloud.prepare import FACING
 from torchgrasp.control.holding import PUSH
 from torchgrasp.control.uncertainty_closing import STALLED
 from torchgrasp.evaluation import PROTOCOLS
-from torchgrasp.evaluation.run import PLAN_LIMIT, TRIAL_LIMIT
+from torchgrasp.evaluation.sweep import PLAN_LIMIT, TRIAL_LIMIT
+from torchgrasp.foundation import limits
 from torchgrasp.hand.collision_shapes import collision_pairs
 from torchgrasp.planner.run import BEST
 from torchgrasp.shape.fit import MAX_BUDGET
-from torchgrasp.specs import FLAT_RADII, SEPARATION, TIP_RADIUS
+from torchgrasp.values.specs import FLAT_RADII, SEPARATION, TIP_RADIUS
 
 GUIDES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
 NUMBER = r"(?<![\w.\-])(?:\d[\d,]*(?:\.\d+)?|\.\d+|two|three|four|five|six|seven|eight|nine|ten|twenty|thirty)"

@@ -10,9 +10,9 @@ from benchmarks.perturb import BESIDE, PERTURBATIONS, Perturbation, perturb_tria
 from scipy.spatial.transform import Rotation
 
 from tests.make import directions, real
-from torchgrasp.errors import BadArgument
-from torchgrasp.specs import TrialSpec
-from torchgrasp.values import PointCloud
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.values.planning import PointCloud
+from torchgrasp.values.specs import TrialSpec
 
 RADIUS, CAMERA, CENTRE = 0.04, real([0.4, 0.1, 0.3]), real([0.0, 0.0, 0.04])
 DISTANCE = float((CAMERA - CENTRE).norm())

@@ -12,8 +12,8 @@ from paper.trials import in_order, most_certain_first, run_cells
 from paper.whole import PARTS, Sizes, Whole, reproduce
 
 from tests.pinch import pinch
-from torchgrasp.base import join
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.base import join
+from torchgrasp.foundation.errors import BadArgument, Status
 
 TINY = Sizes(starts=8, drawn=8, postures=200, fitted=100, apart=50, folds=2, families=0, grasps=2, draws=1)
 

@@ -14,7 +14,7 @@ from benchmarks.scene.scenes import scatter
 from tests.make import box
 from tests.pinch import QUICK, cylinder, pinch
 from torchgrasp.cloud.camera import look_at
-from torchgrasp.errors import Status
+from torchgrasp.foundation.errors import Status
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SIZE = (0.04, 0.04, 0.06)

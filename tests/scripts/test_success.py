@@ -10,7 +10,7 @@ from train.measured import Trials
 from train.success import find_bands, fit_model, judge, keep_trials
 
 from torchgrasp.success.features import FEATURES
-from torchgrasp.success.model import load_model
+from torchgrasp.success.model import load_success_model
 from torchgrasp.success.promise import Promise
 
 
@@ -100,7 +100,7 @@ def test_the_bench_counts_the_best_grasp_two_tries_and_the_promise(monkeypatch):
 
 
 def test_the_shipped_model_names_all_features():
-    model = load_model()
+    model = load_success_model()
     friction, mass = (model.range[FEATURES.index(name)].tolist() for name in ("friction", "mass"))
     assert friction[1] == -mass[0] > 1e8 and friction[0] < 0.3 and 0.5 < mass[1] < 2.0
     assert len(model.range) == len(model.usual) == len(FEATURES) and int(model.feature.max()) < len(FEATURES)

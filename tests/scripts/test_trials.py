@@ -15,7 +15,7 @@ from train.tasks import FORCE, FRICTION, MASS, Task, draw_ordinary, draw_task
 from train.trials import choose_ranks, read_rows, run_trials
 
 from torchgrasp.data.shards import load_shard
-from torchgrasp.errors import Status
+from torchgrasp.foundation.errors import Status
 from torchgrasp.success.features import FEATURES
 
 

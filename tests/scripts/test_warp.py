@@ -10,8 +10,8 @@ import trimesh
 from benchmarks.gpu.warp_pulls import pull_grasps
 
 from tests.pinch import HEIGHT, cylinder, pinch
-from torchgrasp.errors import BadArgument, MissingExtra, Status
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, pull_grasp
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, Status
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 PROTOCOL = dataclasses.replace(

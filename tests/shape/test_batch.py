@@ -5,7 +5,7 @@ import torch
 
 from tests.make import cup_view
 from torchgrasp import fit_shape, load_object
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.hollow import HollowShape
 

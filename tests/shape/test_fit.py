@@ -9,10 +9,10 @@ from torch import Tensor
 
 from tests.make import ball, cup_view, near, real
 from torchgrasp import PointCloud, ShapeGP, fit_shape
-from torchgrasp.errors import BadArgument, IndefiniteCovariance, SuspiciousScale
+from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance, SuspiciousScale
 from torchgrasp.shape.conditioning import Criterion
+from torchgrasp.shape.extra_observations import STD_FACTORS
 from torchgrasp.shape.kernel import Kernel, KernelName, matern52_kernel
-from torchgrasp.shape.support import STD_FACTORS
 
 
 def _side(angle_from: float, angle_to: float) -> Tensor:
@@ -112,7 +112,7 @@ def test_a_whole_surface_without_normals_is_refused_and_not_turned_inside_out(vi
 
 
 @pytest.mark.promise("N8")
-@pytest.mark.filterwarnings("ignore::torchgrasp.errors.FewPoints")
+@pytest.mark.filterwarnings("ignore::torchgrasp.foundation.errors.FewPoints")
 def test_few_points_in_float32_give_a_shape_in_float64(cloud: PointCloud):
     few = PointCloud(cloud.points[::30], None, cloud.viewpoint).to(torch.float32)
     shape = fit_shape(few)

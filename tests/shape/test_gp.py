@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from tests.make import covariance, fit_half_sphere, half_sphere, near, queries, real
-from torchgrasp import PointCloud, ShapeGP
-from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp import PointCloud, ShapeGP, fit_shape
+from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.shape import Normalisation, Observations, condition, extract_surface, fit_shape
+from torchgrasp.shape import Normalisation, Observations, condition, extract_surface
 from torchgrasp.shape.conditioning import longest_distance
 from torchgrasp.shape.kernel import thin_plate
 

@@ -12,18 +12,16 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.autograd.forward_ad import dual_level, make_dual, unpack_dual
 
 from tests.make import cup_view, directions, near, real
-from torchgrasp import PointCloud
-from torchgrasp.base import named_tensors
-from torchgrasp.errors import BadArgument
+from torchgrasp import PointCloud, ShapeGP, fit_shape
+from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.shape import (
     HollowShape,
     Kernel,
     Normalisation,
     Observations,
-    ShapeGP,
     condition,
     extract_surface,
-    fit_shape,
     matern52_kernel,
     rbf_kernel,
     surface_field,

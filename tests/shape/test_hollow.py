@@ -9,9 +9,9 @@ from tests.make import CUP_RADIUS as RADIUS
 from tests.make import cup, cup_view, near
 from tests.make import cylinder_points as ring
 from torchgrasp import Contacts, fit_shape
+from torchgrasp.contacts.closure_probability import line_posterior
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.mesh import closest_on_triangles
-from torchgrasp.plan.closure_probability import line_posterior
 from torchgrasp.shape.hollow import HollowShape, Middle, tie_walls
 from torchgrasp.shape.surface import extract_surface
 

@@ -9,9 +9,10 @@ import torch
 from sklearn.gaussian_process.kernels import RBF, Matern
 
 from tests.make import covariance, dense_posterior, fit_half_sphere, half_sphere, near, queries, real
-from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.conditioning import append_observations, posterior_given
+from torchgrasp.shape.estimate import Observations
 from torchgrasp.shape.kernel import (
     Kernel,
     KernelName,
@@ -23,7 +24,6 @@ from torchgrasp.shape.kernel import (
     thin_plate,
 )
 from torchgrasp.shape.posterior import symmetric_root
-from torchgrasp.shape.values import Observations
 
 EVERY_KERNEL = pytest.mark.parametrize("name", ["thin_plate", "matern52", "rbf"])
 HIDDEN = real([[-1.0, 0.0, 0.0]])

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from tests.make import covariance, dense_posterior, near, real
-from torchgrasp.base import join
-from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.foundation.base import join
+from torchgrasp.foundation.errors import IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.conditioning import Criterion, Selection, posterior_given, select_points
+from torchgrasp.shape.estimate import Observations, on_surface
 from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
-from torchgrasp.shape.values import Observations, on_surface
 
 PSI = 3.6
 PLATE = kernel_by_name("thin_plate", PSI)

@@ -10,7 +10,7 @@ import trimesh
 
 from tests.make import cup_view, near, real
 from torchgrasp import PointCloud, ShapeGP, fit_shape
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.shape.surface import _grid, extract_mesh, extract_surface
 
 RADIUS, CENTER = 0.04, real([0.2, -0.1, 0.3])

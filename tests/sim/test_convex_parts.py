@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from torchgrasp import load_object
-from torchgrasp.errors import MeshError
+from torchgrasp.foundation.errors import MeshError
 from torchgrasp.sim import decompose
 from torchgrasp.sim.convex_parts import check_parts, convex_parts, hull
 

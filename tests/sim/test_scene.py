@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.laws.scenes import check_scene
 from torchgrasp import load_hand
-from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.mujoco_scene import OBJECT
 from torchgrasp.sim.scene_spec import (

@@ -10,8 +10,8 @@ import trimesh
 
 from tests.pinch import QUICK, close, cylinder, pinch, quick_trial
 from torchgrasp import load_hand
-from torchgrasp.errors import HandFileError, Status
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
+from torchgrasp.foundation.errors import HandFileError, Status
 from torchgrasp.sim.scene_spec import SceneSpec, pair_masks
 from torchgrasp.sim.simulated_hand import open_scene
 

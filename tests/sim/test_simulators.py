@@ -10,12 +10,12 @@ import trimesh
 
 from tests.pinch import QUICK, close, cylinder, pinch, quick_trial
 from torchgrasp import Status, close_hand
-from torchgrasp.closure import ClosingOptions
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, Truth, pull_grasp
 from torchgrasp.evaluation.trial import TrialDriver, TrialRun
 from torchgrasp.sim import SceneSpec, open_scene
-from torchgrasp.specs import TrialSpec
-from torchgrasp.values import Contacts
+from torchgrasp.values.closing import ClosingOptions
+from torchgrasp.values.planning import Contacts
+from torchgrasp.values.specs import TrialSpec
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 PULL = PROTOCOLS["dexgraspbench"].with_trial(mass=0.05)

@@ -13,7 +13,7 @@ from torchgrasp.shape.surface import collision_field, extract_mesh
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import SuccessModel
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.values.planning import Certificate, Contacts, Grasps
 
 RADIUS = 0.04
 

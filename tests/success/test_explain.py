@@ -12,12 +12,12 @@ from tests.make import load_hand
 from tests.success.scenes import stump
 from torchgrasp import GraspTask, explain_success, fit_shape, load_object
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import move
-from torchgrasp.success import explain
-from torchgrasp.success.explain import SENTENCES, measure_again
+from torchgrasp.success import reasons as explain
 from torchgrasp.success.features import CAUSES, FEATURES
-from torchgrasp.success.model import load_model
+from torchgrasp.success.model import load_success_model
+from torchgrasp.success.reasons import SENTENCES, measure_again
 
 UNITS = {name: unit for names in CAUSES.values() for name, unit in names.items()}
 SHOWN = {"m": (1000.0, " mm"), "rad": (180 / math.pi, " degrees"), "1": (1.0, ""), "N": (1.0, " N"), "kg": (1.0, " kg")}
@@ -39,7 +39,7 @@ def features():
 @pytest.fixture
 def use(monkeypatch):
     """Explain by a model of one tree."""
-    return lambda model: monkeypatch.setattr(explain, "load_model", lambda device: model)
+    return lambda model: monkeypatch.setattr(explain, "load_success_model", lambda device: model)
 
 
 def wary(name, usual=None):
@@ -50,7 +50,7 @@ def wary(name, usual=None):
 
 
 def test_the_cost_of_a_cause_is_what_its_usual_values_gain_and_the_three_greatest_are_told():
-    model, row = load_model(), features()
+    model, row = load_success_model(), features()
     gains = {}
     for cause, names in CAUSES.items():
         better = row.clone()

@@ -9,16 +9,16 @@ import torch
 
 from tests.make import directions, near, real
 from tests.success.scenes import RADIUS, UNEVEN, around, ball_body, grasps_at, whole_ball
-from torchgrasp.base import join
-from torchgrasp.errors import BadArgument
+from torchgrasp.contacts.balance import least_friction_forces
+from torchgrasp.foundation.base import join
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import move
-from torchgrasp.plan.forces import least_friction_forces
 from torchgrasp.success.features import CAUSES, FEATURES, measure_grasps
 from torchgrasp.success.loads import carrying_force, greatest_force
 from torchgrasp.success.moved import touch_moved
 from torchgrasp.success.task import GraspTask
-from torchgrasp.values import Contacts
+from torchgrasp.values.planning import Contacts
 
 VERTICES = RADIUS * directions(3000, seed=1) * real([1.0, 0.8, 0.6]) + real([0.0, 0.004, -0.01])
 EVEN = (0.0, 2 * math.pi / 3, 4 * math.pi / 3)

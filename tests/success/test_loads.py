@@ -11,22 +11,22 @@ import torch
 from tests.make import load_hand, near, real, spokes, touched_contacts
 from tests.pinch import pinch
 from tests.success.scenes import around, grasps_at
+from torchgrasp.contacts.balance import least_friction_forces, tangential_ratio
 from torchgrasp.geometry.frames import apply, inverse, rotate, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
-from torchgrasp.success.loads import carrying_force, greatest_force, load_arm, log_odds_about
-from torchgrasp.values import Contacts
+from torchgrasp.success.loads import carrying_force, greatest_force, lever_arm, log_odds_about
+from torchgrasp.values.planning import Contacts
 
 
 def test_the_arm_of_a_load_is_about_the_longest_side_of_the_best_three_in_any_frame_or_order(generator):
     points = torch.randn(20, 5, 3, generator=generator, dtype=torch.float64)
     center = real([0.5, 0.1, -0.3])
-    threes = torch.stack([load_arm(points[:, list(k)], center) for k in itertools.combinations(range(5), 3)])
-    assert torch.equal(load_arm(points, center), threes.amin(0))
-    assert bool((load_arm(points, center) <= load_arm(points[:, :4], center)).all())
+    threes = torch.stack([lever_arm(points[:, list(k)], center) for k in itertools.combinations(range(5), 3)])
+    assert torch.equal(lever_arm(points, center), threes.amin(0))
+    assert bool((lever_arm(points, center) <= lever_arm(points[:, :4], center)).all())
     points = 0.05 * torch.randn(30, 3, 3, generator=generator, dtype=torch.float64)
     center = real([0.01, -0.02, 0.015])
-    found = load_arm(points, center)
+    found = lever_arm(points, center)
     for row in range(10):
         p = points[row].numpy()
         first, second, third = max(((0, 1, 2), (1, 2, 0), (2, 0, 1)), key=lambda s: np.linalg.norm(p[s[0]] - p[s[1]]))
@@ -34,8 +34,8 @@ def test_the_arm_of_a_load_is_about_the_longest_side_of_the_best_three_in_any_fr
         gaps = [np.linalg.norm(np.cross(side, x - p[first])) / np.linalg.norm(side) for x in (center.numpy(), p[third])]
         assert float(found[row]) == pytest.approx(gaps[0] / (gaps[1] + 0.01))
     turn = rotation_from_vector(real([0.3, -1.0, 2.0]))
-    torch.testing.assert_close(load_arm(points[:, [2, 0, 1]] @ turn.T + 1.0, turn @ center + 1.0), found)
-    assert load_arm(points[:0], center).shape == (0,)
+    torch.testing.assert_close(lever_arm(points[:, [2, 0, 1]] @ turn.T + 1.0, turn @ center + 1.0), found)
+    assert lever_arm(points[:0], center).shape == (0,)
 
 
 @pytest.mark.parametrize("push", [0.0, 2.0])

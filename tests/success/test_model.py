@@ -12,7 +12,7 @@ from train.success import directions, read_trees
 from tests.make import near
 from tests.success.scenes import stump
 from torchgrasp.success.features import FEATURES
-from torchgrasp.success.model import load_model
+from torchgrasp.success.model import load_success_model
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def draw_features(model, rows, generator):
 
 @pytest.mark.parametrize("name", directions())
 def test_the_shipped_model_never_errs_in_the_direction_of_a_feature(name, generator):
-    model, column = load_model(), FEATURES.index(name)
+    model, column = load_success_model(), FEATURES.index(name)
     less, other = draw_features(model, 4000, generator), draw_features(model, 4000, generator)
     more = less.clone()
     more[:, column] = torch.maximum(less[:, column], other[:, column])
@@ -88,7 +88,7 @@ def test_the_shipped_model_never_errs_in_the_direction_of_a_feature(name, genera
 
 def test_the_shipped_model_reads_the_task(generator):
     """A test of directions alone would pass a model that says nothing."""
-    model, column = load_model(), FEATURES.index("force to spare")
+    model, column = load_success_model(), FEATURES.index("force to spare")
     less, other = draw_features(model, 4000, generator), draw_features(model, 4000, generator)
     more = less.clone()
     more[:, column] = torch.maximum(less[:, column], other[:, column])
@@ -96,7 +96,7 @@ def test_the_shipped_model_reads_the_task(generator):
 
 
 def test_the_shipped_model_is_of_these_features_and_its_numbers_fit_together():
-    model = load_model()
+    model = load_success_model()
     assert model.range.shape == (len(FEATURES), 2) and model.usual.shape == (len(FEATURES),)
     assert bool(((model.range[:, 0] <= model.usual) & (model.usual <= model.range[:, 1])).all())
     assert bool(((model.feature >= 0) & (model.feature < len(FEATURES))).all())

@@ -7,10 +7,10 @@ import torch
 
 from tests.make import near, real
 from tests.success.scenes import RADIUS, UNEVEN, around, grasps_at
+from torchgrasp.contacts.balance import forces_near, internal_forces, least_friction_forces, tangential_ratio
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import move
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.plan.forces import forces_near, internal_forces, least_friction_forces, tangential_ratio
 from torchgrasp.success.moved import touch_moved, trace
 
 

@@ -8,12 +8,12 @@ import torch
 
 from tests.make import near, real
 from tests.success.scenes import around, grasps_at, stump
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.success import order
 from torchgrasp.success.features import FEATURES
-from torchgrasp.success.model import load_model
+from torchgrasp.success.model import load_success_model
 from torchgrasp.success.promise import Promise
-from torchgrasp.values import format_success
+from torchgrasp.values.planning import format_success
 
 OK, FAILED = int(Status.OK), int(Status.BURIED)
 MODEL = stump("mass", 0.5, 1.0, -1.0)
@@ -22,7 +22,7 @@ MODEL = stump("mass", 0.5, 1.0, -1.0)
 @pytest.fixture
 def model(monkeypatch):
     """A model whose trials have every feature between -10 and 10."""
-    monkeypatch.setattr(order, "load_model", lambda device="cpu": MODEL)
+    monkeypatch.setattr(order, "load_success_model", lambda device="cpu": MODEL)
 
 
 def grasps_of(scores, status=None, known=None):
@@ -34,21 +34,21 @@ def grasps_of(scores, status=None, known=None):
 
 @pytest.mark.parametrize("name", order.DOMAIN)
 def test_a_prediction_is_known_up_to_the_edges_of_the_trials(name):
-    least, most = load_model().range[FEATURES.index(name)].tolist()
+    least, most = load_success_model().range[FEATURES.index(name)].tolist()
     at = torch.tensor([-math.inf, least, (least + most) / 2, most, math.inf], dtype=torch.float64)
     beside = [math.nextafter(least, -math.inf), math.nextafter(most, math.inf)]
-    rows = load_model().range.mean(1).repeat(7, 1)
+    rows = load_success_model().range.mean(1).repeat(7, 1)
     rows[:, FEATURES.index(name)] = torch.cat([at, real(beside)])
-    assert order.is_known(rows).tolist() == [False, True, True, True, False, False, False]
-    assert order.is_known(rows[:0]).shape == (0,)
+    assert order.is_covered(rows).tolist() == [False, True, True, True, False, False, False]
+    assert order.is_covered(rows[:0]).shape == (0,)
 
 
 def test_other_features_may_be_outside_of_the_trials():
-    row = load_model().range.mean(1)
+    row = load_success_model().range.mean(1)
     others = [k for k, name in enumerate(FEATURES) if name not in order.DOMAIN]
     row[others] = 1e6
-    assert order.is_known(row[None]).tolist() == [True]
-    assert order.largest_known() == float(load_model().range[FEATURES.index("size"), 1])
+    assert order.is_covered(row[None]).tolist() == [True]
+    assert order.largest_known() == float(load_success_model().range[FEATURES.index("size"), 1])
 
 
 def test_the_order_is_known_then_unknown_then_failed_each_by_falling_score(generator):

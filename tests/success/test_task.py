@@ -5,9 +5,9 @@ import math
 import pytest
 
 from torchgrasp import GraspTask
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.specs import TrialSpec
+from torchgrasp.values.specs import TrialSpec
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Pose, Seed, checked
 from torchgrasp.data.accept import HandLike, as_hand
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Pose, Seed, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, real
 from torchgrasp.hand.collision_shapes import ALWAYS, cover
 from torchgrasp.hand.hand import Hand
@@ -126,7 +126,7 @@ def load_arm(
     >>> load_arm(load_hand("allegro").urdf_path, "allegro", "thumb_tip")
     Traceback (most recent call last):
         ...
-    torchgrasp.errors.BadArgument: tip: expected a link that at least six joints move, got 'thumb_tip'
+    torchgrasp.foundation.errors.BadArgument: tip: expected a link that at least six joints move, got 'thumb_tip'
     """
     hand, whole = as_hand(hand, "hand"), read_published(urdf)
     named = {link.name: link for link in whole.links}

@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.arm.arm import LEVER, Arm, features
-from torchgrasp.base import in_chunks
-from torchgrasp.errors import Status
+from torchgrasp.foundation.base import in_chunks
+from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.optim import SOLVED
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.motion import APPROACH_DISTANCE, COARSE_STEPS, UP, opened_pose
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 Way = tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"], Float[Tensor, "g 2"]]
 """The postures on the way through each grasp, whether the arm can go it, and its ease, as in `Grasps`."""

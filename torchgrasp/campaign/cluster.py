@@ -13,13 +13,13 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
-from torchgrasp.errors import BadArgument, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.protocols import Protocol
-from torchgrasp.evaluation.views import EvaluationSpec, View, choose_rows, plan_view, plan_views, try_grasp
+from torchgrasp.evaluation.views import EvaluationSpec, ObjectView, choose_rows, plan_view, plan_views, try_grasp
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError, Status
+from torchgrasp.foundation.threads import one_thread
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.many import no_grasps
-from torchgrasp.threads import one_thread
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoco", "coacd")
 """Packages whose versions may change the results of a campaign."""
@@ -59,7 +59,12 @@ def plan_jobs(meta: dict[str, str], *task: Any) -> list[Grasps | None]:
 
 
 def run_job(
-    view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str], plans: object = None, place: int = 0
+    view: ObjectView,
+    protocol: Protocol,
+    spec: EvaluationSpec,
+    meta: dict[str, str],
+    plans: object = None,
+    place: int = 0,
 ) -> bytes:
     """Plan and try the grasps of one job; return the bytes of a shard file that holds only this job.
 
@@ -81,7 +86,7 @@ def run_job(
     return pack_shard(shard, meta)
 
 
-def _work(view: View, hand: Hand, protocol: Protocol, spec: EvaluationSpec, plan: Grasps | None) -> Shard:
+def _work(view: ObjectView, hand: Hand, protocol: Protocol, spec: EvaluationSpec, plan: Grasps | None) -> Shard:
     """Plan grasps on the view of a job unless there is a plan, and try the chosen grasps in simulation."""
     score, cloud, found = plan_view(view, protocol, spec, plan)
     row = JobRow(view.object, view.view, score.refusal, short(score.note), score.family, score.group)

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 from torchgrasp.data.reader import CARD, GraspShards, read_shards, shard_path
 from torchgrasp.data.shards import JobRow, Shard, join_shards, load_shard, pack_shard
-from torchgrasp.data.tables import render_card
-from torchgrasp.errors import ModelFileError, Status
+from torchgrasp.data.table_folder import render_card
 from torchgrasp.files import begin_folder, format_json, hold_folder, remove_file, sha256, write_file
+from torchgrasp.foundation.errors import ModelFileError, Status
 
 ASKED, README, PARTS = "campaign.json", "README.md", "parts"
 """Names in a campaign's folder: its request, its text for people, and the folder for jobs of incomplete shards."""

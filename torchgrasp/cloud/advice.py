@@ -6,18 +6,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import LAYER, find_second_body
 from torchgrasp.cloud.prepare import FACING, share_facing
 from torchgrasp.cloud.viewpoint import MAX_BEHIND, MAX_EDGE_ON, share_unseen
-from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.errors import BadArgument, NoSupport
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import LEAST_WIDTH, find_supports
-from torchgrasp.lazy import spatial
-from torchgrasp.values import PointCloud
+from torchgrasp.geometry.support_planes import LEAST_WIDTH, find_supports
+from torchgrasp.values.planning import PointCloud
 
 FEWEST = 50  # fewest points that show whether a camera is right, or whether pixels fly off rims
 

@@ -5,12 +5,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
-from torchgrasp.lazy import trimesh
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 
 def check_agreement(

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.checks import Range, Seed, checked
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.pose import check_rigid
 from torchgrasp.cloud.sensor import Image, SensorName, SensorNoise, add_noise, find_sensor
-from torchgrasp.errors import MeshError
+from torchgrasp.foundation.checks import Range, Seed, checked
+from torchgrasp.foundation.errors import MeshError
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
-from torchgrasp.lazy import trimesh
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 Transform = Float[Tensor, "4 4"]
 WIDTH, HEIGHT, FOCAL = 640, 480, 616.0  # columns, rows and focal length [px] of the default camera

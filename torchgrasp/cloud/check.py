@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.checks import Range, checked
 from torchgrasp.cloud.neighbours import find_inliers
-from torchgrasp.errors import BadArgument, SuspiciousScale, TooFewPoints
-from torchgrasp.lazy import spatial
-from torchgrasp.limits import MAX_EXTENT, MIN_EXTENT
-from torchgrasp.values import PointCloud
+from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.foundation.lazy import spatial
+from torchgrasp.foundation.limits import MAX_EXTENT, MIN_EXTENT
+from torchgrasp.values.planning import PointCloud
 
 MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated
 FEW_POINTS = 100  # fewer points are a speck of noise, or too coarse for a shape

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.checks import Positive, check_tensor, checked
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.pose import check_view, read_camera_pose
-from torchgrasp.errors import BadArgument, TooFewPoints
+from torchgrasp.foundation.checks import Positive, check_tensor, checked
+from torchgrasp.foundation.errors import BadArgument, TooFewPoints
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 Array = Tensor | np.ndarray
 MIN_DEPTH, MAX_DEPTH = 0.06, 50.0  # least and greatest depth [m] that depth cameras measure

@@ -8,18 +8,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
-from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes, is_flat, nearest
+from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_local_planes, is_flat, nearest
 from torchgrasp.cloud.prepare import FACING, MAX_POINTS, NormalCheck, clean_cloud, compare_normals, share_facing
 from torchgrasp.cloud.viewpoint import guess_viewpoint
-from torchgrasp.errors import BadArgument
 from torchgrasp.files import render
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import check_tensor, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 
 @checked
@@ -80,7 +80,7 @@ def diagnose_cloud(
     vertical, guessed, angle = unit(vertical.double()), view, 0.0
     if view.viewpoint is None:
         seen = view.points.double()[find_inliers(view.points.double())]
-        eye, likely = guess_viewpoint(seen, fit_planes(seen)[0], vertical, assumed=up is None)
+        eye, likely = guess_viewpoint(seen, fit_local_planes(seen)[0], vertical, assumed=up is None)
         if view.normals is None or share_facing(view.points, view.normals, eye.to(view.points)) >= FACING:
             guessed, angle = dataclasses.replace(view, viewpoint=eye.to(view.points)), likely
     clean = clean_cloud(guessed)
@@ -95,7 +95,7 @@ def diagnose_cloud(
         size=(x, y, z),
         spacing=float(distance[:, 1].median()),
         density=float(((distance.shape[1] - 1) / area).median()),
-        noise=float(fit_planes(points, rows)[1].median()),
+        noise=float(fit_local_planes(points, rows)[1].median()),
         copies=len(cloud) - len(whole),
         outliers=round(len(points) * float((~find_inliers(points, rows)).double().mean())),
         normals=check,

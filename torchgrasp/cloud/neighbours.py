@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, unit
-from torchgrasp.lazy import spatial
 
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
@@ -45,7 +45,9 @@ def is_flat(points: Points) -> bool:
     return float(thickness) < max(2 * float(fit_quadrics(points)[2].median()), 1e-3 * float(length))
 
 
-def fit_planes(points: Points, rows: Int[Tensor, "m"] | None = None) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
+def fit_local_planes(
+    points: Points, rows: Int[Tensor, "m"] | None = None
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
     """Fit a plane around each point in `rows`, by default each point; return normals of any sign and rms errors [m]."""
     distance, index = nearest(points, 25, rows)  # about eight for each of a plane's three unknowns
     mean_squares, axes = _principal_axes(points[index], _weigh(distance))

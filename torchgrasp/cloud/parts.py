@@ -7,14 +7,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.checks import Range, checked
 from torchgrasp.cloud.check import MIN_POINTS, first_of_each
-from torchgrasp.errors import NoSupport, TooFewPoints
+from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.errors import NoSupport, TooFewPoints
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import number_components
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import Support, find_supports
-from torchgrasp.lazy import spatial
-from torchgrasp.values import PointCloud
+from torchgrasp.geometry.support_planes import SupportPlane, find_supports
+from torchgrasp.values.planning import PointCloud
 
 LAYER = 0.004  # least half thickness [m] of a support's layer, for the noise of a depth camera at half a metre
 GAP = 0.04  # least distance [m] between bodies; a bent or hidden surface of one body leaves smaller gaps
@@ -94,7 +94,7 @@ def cut_object(
     return _select(cloud, label == wanted, "points of the object"), None if support is None else support.plane
 
 
-def _find_support(cloud: PointCloud, up: Float[Tensor, "3"]) -> Support | None:
+def _find_support(cloud: PointCloud, up: Float[Tensor, "3"]) -> SupportPlane | None:
     """Return the plane on which a scene's objects stand: nearly level, else any that the camera looks down on."""
     eye = cloud.viewpoint if cloud.viewpoint is None or cloud.viewpoint.ndim == 1 else cloud.viewpoint.mean(0)
     for sky in (up, *([None] if eye is not None else [])):

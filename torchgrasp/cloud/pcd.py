@@ -6,7 +6,7 @@ import numpy as np
 
 from torchgrasp.files import Malformed
 from torchgrasp.files.columns import find_columns, read_fields
-from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
+from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:

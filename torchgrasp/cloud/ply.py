@@ -6,9 +6,9 @@ import numpy as np
 
 from torchgrasp.files import Malformed, explain
 from torchgrasp.files.columns import find_columns, read_fields
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.limits import CLOUD_POINTS, TEXT_MESH_BYTES
 from torchgrasp.geometry.mesh import load_triangles
-from torchgrasp.lazy import trimesh
-from torchgrasp.limits import CLOUD_POINTS, TEXT_MESH_BYTES
 
 TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import RIGID, check_tensor, is_rigid
-from torchgrasp.cloud.tables import parse_npy, read_suffixed
-from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.cloud.safe_files import parse_npy, read_suffixed
 from torchgrasp.files import explain
 from torchgrasp.files.columns import read_lines
+from torchgrasp.foundation.checks import RIGID, check_tensor, is_rigid
+from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import Support, find_table
+from torchgrasp.geometry.support_planes import SupportPlane, find_table
 
 UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count is"
 
@@ -80,7 +80,7 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
 
 def find_plausible(
     points: Points, pose: Float[Tensor, "4 4"], table: Plane | float | None, up: object, known_unit: bool
-) -> tuple[Support, ...]:
+) -> tuple[SupportPlane, ...]:
     """Return the planes on which objects may stand; refuse a pose or a depth unit that contradicts the view."""
     eye = pose[:3, 3]
     try:
@@ -111,7 +111,9 @@ def _is_own(pose: Float[Tensor, "4 4"]) -> bool:
     return float(torch.diagonal(pose[:3, :3]).min()) > 0.985 and float(torch.linalg.vector_norm(pose[:3, 3])) < 0.1
 
 
-def _check_supports(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
+def _check_supports(
+    supports: tuple[SupportPlane, ...], pose: Float[Tensor, "4 4"], up: object, known_unit: bool
+) -> None:
     """Refuse a pose that contradicts the planes on which objects stand, or a camera too high above the first one."""
     plane = supports[0].plane
     if not _is_own(pose):
@@ -122,7 +124,7 @@ def _check_supports(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], u
         raise BadArgument("depth", f"a camera {height:.3g} m above the table", UNIT)
 
 
-def _check_normals(supports: tuple[Support, ...], pose: Float[Tensor, "4 4"], up: object) -> None:
+def _check_normals(supports: tuple[SupportPlane, ...], pose: Float[Tensor, "4 4"], up: object) -> None:
     """Refuse a pose with the table upside down, or tilted where another pose convention would make it level."""
     sky = torch.tensor([0.0, 0.0, 1.0]).double() if up is None else unit(torch.as_tensor(up).double().cpu())
     normals = torch.stack([support.plane.normal.double() for support in supports])

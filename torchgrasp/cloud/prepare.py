@@ -7,16 +7,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import checked
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
-from torchgrasp.cloud.neighbours import find_inliers, fit_planes, fit_quadrics, nearest
+from torchgrasp.cloud.neighbours import find_inliers, fit_local_planes, fit_quadrics, nearest
 from torchgrasp.cloud.pose import check_rigid
 from torchgrasp.cloud.viewpoint import guess_viewpoint
-from torchgrasp.errors import BadArgument, TooFewPoints
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, TooFewPoints
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit, unit_of_any
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
 MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time of the selection
@@ -78,7 +78,7 @@ def prepare_cloud(
         cloud = _fit_normals(cloud, clean, up)
     precise = cloud.to(torch.float64)
     if clean and precise.viewpoint is None:
-        guess = guess_viewpoint(precise.points, fit_planes(precise.points)[0], up)[0].to(points.dtype)
+        guess = guess_viewpoint(precise.points, fit_local_planes(precise.points)[0], up)[0].to(points.dtype)
         precise = dataclasses.replace(precise, viewpoint=guess.double())
     if len(precise) > MAX_POINTS:
         precise = precise.select(torch.randperm(len(precise), generator=generator)[:MAX_POINTS].to(points.device))

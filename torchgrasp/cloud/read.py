@@ -11,20 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgrasp.base import Value, named_tensors
-from torchgrasp.checks import check_tensor, checked
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
-from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_planes
+from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_local_planes
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
-from torchgrasp.cloud.tables import parse_npy, parse_npz
+from torchgrasp.cloud.safe_files import parse_npy, parse_npz
 from torchgrasp.cloud.viewpoint import can_see
-from torchgrasp.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.files import explain, read_bounded, write_file
 from torchgrasp.files.columns import find_columns, parse_text
+from torchgrasp.foundation.base import Value, named_tensors
+from torchgrasp.foundation.checks import check_tensor, checked
+from torchgrasp.foundation.errors import BadArgument, CloudFileError, TooFewPoints
+from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.limits import CLOUD_BYTES, CLOUD_POINTS
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 TEXTS = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb")  # tables of numbers
 
@@ -78,7 +78,7 @@ def read_cloud(
 
     >>> read_cloud("scan.docx")
     Traceback (most recent call last):
-    torchgrasp.errors.CloudFileError: path: expected a file ending in .ply, ..., got scan.docx
+    torchgrasp.foundation.errors.CloudFileError: path: expected a file ending in .ply, ..., got scan.docx
     """
     return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
 
@@ -93,7 +93,7 @@ def read_cloud_file(
 
     >>> read_cloud_file("none.ply")
     Traceback (most recent call last):
-    torchgrasp.errors.CloudFileError: path: expected a .ply file, got none.ply, which is no file
+    torchgrasp.foundation.errors.CloudFileError: path: expected a .ply file, got none.ply, which is no file
     """
     try:
         position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
@@ -143,7 +143,7 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):
-    torchgrasp.errors.BadArgument: path: expected a file ending in .npz or .ply, got cloud.txt
+    torchgrasp.foundation.errors.BadArgument: path: expected a file ending in .npz or .ply, got cloud.txt
     """
     path = Path(path)
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
@@ -271,7 +271,7 @@ def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
     points = cloud.points[draw_rows(len(cloud), 2000)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]
-        if can_see(points, fit_planes(points)[0], torch.zeros(3, dtype=points.dtype)):
+        if can_see(points, fit_local_planes(points)[0], torch.zeros(3, dtype=points.dtype)):
             return cloud
     default = "the default viewpoint (0, 0, 0) of PCD"
     notes.append(f"{default}, from which a camera cannot have seen these points, was left out (--viewpoint gives one)")

@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import ndimage, optimize
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.lazy import ndimage, optimize
 
 Image = Float[Tensor, "h w"]
 SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]

@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows, nearest
-from torchgrasp.errors import NoSupport
+from torchgrasp.foundation.errors import NoSupport
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector, fibonacci_sphere, unit
-from torchgrasp.geometry.support import find_supports
-from torchgrasp.lazy import spatial
+from torchgrasp.geometry.support_planes import find_supports
 
 MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
 """Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""

@@ -9,9 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_device, settle
-from torchgrasp.checks import Range, checked
-from torchgrasp.closure import ClosingOptions, choose_options
 from torchgrasp.control.holding import ForceHold, GripHold, keep_targets
 from torchgrasp.control.object_pose import Touches
 from torchgrasp.control.paper.closings import Impedance, OpenLoopClosing, PaperClosing, PositionClosing
@@ -21,11 +18,14 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.relook import relocate
 from torchgrasp.control.tactile import STILL, Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.base import check_device, settle
+from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rigid
 from torchgrasp.hand.hand import Hand
-from torchgrasp.specs import ClosingMode, HoldingMode, check_modes, default_holding
-from torchgrasp.values import PointCloud
+from torchgrasp.values.closing import ClosingOptions, choose_options
+from torchgrasp.values.planning import PointCloud
+from torchgrasp.values.specs import ClosingMode, HoldingMode, check_modes, default_holding
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
 """Function of an observation and the time [s] to the next tick, which returns the targets [rad] of all joints."""
@@ -58,7 +58,8 @@ class GraspController:
             whose options allow no stops, or whose plan lacks a table, a surface or tactile fingertips.
 
     >>> from torchgrasp import load_hand
-    >>> from torchgrasp.control import ClosingReference, no_contact, observe
+    >>> from torchgrasp import ClosingReference
+    >>> from torchgrasp.control import no_contact, observe
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand = load_hand("allegro")
     >>> controller = GraspController(ClosingReference.from_grasp(hand, load_shipped_grasp("jug", "allegro")))

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.contacts.balance import least_friction_forces
 from torchgrasp.control.least_forces import Balance, LeastForces, balance, friction_ratios
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, low_pass
-from torchgrasp.errors import Status
+from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, inverse
-from torchgrasp.plan.forces import least_friction_forces
 
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
 RAMP = 0.4  # time [s] in which the forces rise to the desired forces

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from torchgrasp.plan.forces import grasp_map
+from torchgrasp.contacts.balance import grasp_map
 
 Array = np.ndarray
 PENALTY, KNEE = 500.0, 0.9

@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Range, checked
-from torchgrasp.closure import ClosingOptions
+from torchgrasp.contacts.balance import least_friction_forces, tangential_ratio
 from torchgrasp.control.object_pose import Localization, Touches
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.sensing import TORQUE_NOISE
 from torchgrasp.control.tactile import Observation, low_pass
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
+from torchgrasp.foundation.checks import Range, checked
 from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.plan.forces import least_friction_forces, tangential_ratio
+from torchgrasp.values.closing import ClosingOptions
 
 SPEED, ACCELERATION = 0.1, 1.0  # largest speed [m/s] of the approach, and its acceleration [m/s^2]
 PRESSING_TIME = 0.5  # time [s] from the end of closing until the hand counts as closed, and is judged

@@ -9,21 +9,21 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import ANY, Force, Pose, Positive, Range, check_tensor, checked
-from torchgrasp.closure import ClosingGains, SensorModel
-from torchgrasp.control import forces, law
+from torchgrasp.control import finger_forces, law
 from torchgrasp.control.paper.stability import StabilityModel
 from torchgrasp.control.tactile import Observation
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import ANY, Force, Pose, Positive, Range, check_tensor, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import opened_pose
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Grasps
+from torchgrasp.values.closing import ClosingGains, SensorModel
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ContactSpec
 
 
 @checked
@@ -96,7 +96,7 @@ class ClosingReference(Value):
         not positive, joints beyond their limits, or numbers in the grasp that are not finite.
         """
         check_single(grasp)
-        forces.check_hand(hand, grasp)
+        finger_forces.check_same_hand(hand, grasp)
         contacts = grasp.contacts
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
         check_tensor("grasp.contacts.normals", contacts.normals, (1, len(hand.tips), 3))
@@ -106,16 +106,16 @@ class ClosingReference(Value):
         hand, grasp = hand.to("cpu", torch.float64), grasp.to("cpu", torch.float64)
         hand.actuated.check_limits(grasp.joints, "grasp.joints")
         hand.actuated.check_limits(grasp.pregrasp, "grasp.pregrasp")
-        points, normals = forces.contacts_in_hand(grasp)
+        points, normals = finger_forces.contacts_in_hand(grasp)
         preferred, deviation, sure = None, None, law.FORCE_FLOOR
         if stability is not None:
             tips = points[0] + hand.tips.radius[:, None] * normals[0]
             preferred = stability.preferred_forces(tips, force).forces[None]
             deviation = stability.preferred_forces(tips).covariance.diagonal()[None].sqrt()  # a given force has none
             sure = math.hypot(law.FORCE_FLOOR, float(deviation.min()))
-        desired = forces.desired_forces(points, normals, force, preferred)
+        desired = finger_forces.desired_forces(points, normals, force, preferred)
         covariance, jacobian = law.surface_covariance(normals, std_m), hand.jacobian(grasp.joints, points)
-        compliance = forces.tip_compliance(jacobian, normals, forces.joint_stiffness(hand))
+        compliance = finger_forces.tip_compliance(jacobian, normals, finger_forces.joint_stiffness(hand))
         force_covariance = law.force_covariance(desired, normals, deviation)
         gains = ClosingGains(
             target=points[0],
@@ -125,12 +125,12 @@ class ClosingReference(Value):
             desired_force=desired[0],
             force_source="analytic" if stability is None else "stability",
         )
-        squeeze = forces.press(grasp.joints, jacobian, desired, forces.joint_stiffness(hand, kp)).joints
+        squeeze = finger_forces.press(grasp.joints, jacobian, desired, finger_forces.joint_stiffness(hand, kp)).joints
         pose, opened, joints = grasp.obj_from_hand[0], grasp.pregrasp[0], grasp.joints[0]
         direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
         approach = unit(direction) if bool((direction != 0.0).any()) else None  # in the hand's frame
         plan = cls(
-            hand, forces.drive_stiffness(hand, kp), pose, opened, joints, squeeze[0], normals[0], gains, approach
+            hand, finger_forces.drive_stiffness(hand, kp), pose, opened, joints, squeeze[0], normals[0], gains, approach
         )
         friction = _number(grasp, "friction")
         told = {} if friction is None else {"friction": friction}

@@ -4,12 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 REACH = 0.08  # largest displacement [m] on each axis of the table that `relocate` tries at first
 SCALE = 0.004  # distance [m] from the surface beyond which a point of a new view counts less

@@ -9,8 +9,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import map_tensors
-from torchgrasp.checks import Positive, checked
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import (
     FLAG_CUTOFF,
@@ -25,7 +23,9 @@ from torchgrasp.control.tactile import (
     measure,
     no_contact,
 )
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import map_tensors
+from torchgrasp.foundation.checks import Positive, checked
+from torchgrasp.foundation.errors import BadArgument
 
 WAITING_FORCE = 0.3
 """Largest force [N] of a finger that waits until the others touch, and the reading that stands for a binary contact."""

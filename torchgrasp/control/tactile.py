@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import FINGERTIPS, Value, check_device
-from torchgrasp.checks import ANY, Count, Range, checked
+from torchgrasp.foundation.base import FINGERTIPS, Value, check_device
+from torchgrasp.foundation.checks import ANY, Count, Range, checked
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 

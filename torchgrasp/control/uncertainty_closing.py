@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.closure import ClosingOptions
 from torchgrasp.control.law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, stay_above, tip_velocity
 from torchgrasp.control.object_pose import ContactPlanes
 from torchgrasp.control.paper.closings import SETTLED, Settled, strongest_lead
@@ -15,6 +14,7 @@ from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.sensing import WAITING_FORCE, DriveFeel
 from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.geometry.linalg import limit_norm
+from torchgrasp.values.closing import ClosingOptions
 
 PATIENCE = 2.5  # longest time [s] from the first touch until the closing ends, even if some finger has not touched
 QUICK_TOUCH = 0.45  # reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on

@@ -12,17 +12,17 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Taken, check_path, show
 from torchgrasp.cloud.read import make_cloud, read_cloud_file
 from torchgrasp.data.shipped import GraspObject
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Taken, check_path, show
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, hands_folder, load_hand
 from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.scene import Scene
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 Read = TypeVar("Read")
 CLOUD = (

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import checked
-from torchgrasp.closure import ClosureResult
-from torchgrasp.data.tables import as_table, import_arrow, pack_table, render_card, write_folder
-from torchgrasp.errors import BadArgument
+from torchgrasp.data.table_folder import as_table, import_arrow, pack_table, render_card, write_folder
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.hand.hand import Hand
-from torchgrasp.lazy import spatial
+from torchgrasp.values.closing import ClosureResult
 
 Episodes = Sequence[tuple[str, ClosureResult]]
 

@@ -16,14 +16,14 @@ from pathlib import Path
 
 import torch
 
-from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import read_cloud, save_cloud
-from torchgrasp.errors import DatasetError
 from torchgrasp.files import Field, format_json, read_json, write_file
+from torchgrasp.foundation.checks import Count, Seed, checked
+from torchgrasp.foundation.errors import DatasetError
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.mesh import read_mesh
-from torchgrasp.lazy import trimesh
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 WHOLE = "whole"  # name of the view that shows an object from all sides, with normals: `full_normals.ply`
 MOST_SCALE, MOST_METRES, MOST_MASS = 1e4, 1e4, 1e4

@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 
-from torchgrasp.checks import checked
 from torchgrasp.data.reader import CARD, GraspShards
-from torchgrasp.data.tables import as_column, as_table, import_arrow, pack_table, render_card, write_folder
-from torchgrasp.errors import BadArgument, ModelFileError, Status
-from torchgrasp.lazy import jinja2
+from torchgrasp.data.table_folder import as_column, as_table, import_arrow, pack_table, render_card, write_folder
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
+from torchgrasp.foundation.lazy import jinja2
 
 
 @checked

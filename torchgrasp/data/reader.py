@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.checks import Count, Range, checked
 from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row
-from torchgrasp.errors import ModelFileError
 from torchgrasp.files import Recent, read_json
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.foundation.checks import Count, Range, checked
+from torchgrasp.foundation.errors import ModelFileError
+from torchgrasp.values.planning import Grasps, PointCloud
 
 CARD = "card.json"  # file that describes a data set; it is written last, so a folder with a card is complete
 

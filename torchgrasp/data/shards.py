@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import FINGERTIPS, Value, map_tensors, named_tensors
-from torchgrasp.checks import checked, is_rigid
-from torchgrasp.errors import ModelFileError, Status
 from torchgrasp.files import Field, pack_tensors, read_value
-from torchgrasp.limits import JSON_LETTERS
-from torchgrasp.values import Grasps
+from torchgrasp.foundation.base import FINGERTIPS, Value, map_tensors, named_tensors
+from torchgrasp.foundation.checks import checked, is_rigid
+from torchgrasp.foundation.errors import ModelFileError, Status
+from torchgrasp.foundation.limits import JSON_LETTERS
+from torchgrasp.values.planning import Grasps
 
 KIND = "grasp-shard"  # kind of the file
 MOST = 1_000_000  # most points, grasps and tries of one job

@@ -5,16 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from torchgrasp.checks import checked
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.data.shards import load_grasps
-from torchgrasp.errors import BadArgument
-from torchgrasp.lazy import trimesh
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.scene import Scene
-from torchgrasp.values import Grasps, PointCloud
-
-__all__ = ["GraspObject", "list_objects", "load_object", "load_scene", "load_shipped_grasp"]
+from torchgrasp.values.planning import Grasps, PointCloud
 
 DATA = Path(__file__).parent / "assets"  # `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`
 SCENE = DATA / "scene.npz"  # a depth image of the objects on a table, with labels, camera and table

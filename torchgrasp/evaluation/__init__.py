@@ -1,18 +1,34 @@
 """Trials of grasps in simulation, published protocols, and the evaluation of a folder of objects."""
 
-from torchgrasp.closure import ClosingTrace, Disturbance, ObjectMotion
+from torchgrasp.values.closing import ClosingTrace, Disturbance, ObjectMotion
 from torchgrasp.evaluation.intervals import Share
-from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, find_protocol
 from torchgrasp.evaluation.pull import PullResult, pull_grasp
 from torchgrasp.evaluation.regrasp import LiftTry, lift_grasps
-from torchgrasp.evaluation.run import evaluate
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore, summarise
+from torchgrasp.evaluation.sweep import evaluate
+from torchgrasp.evaluation.summary import ProtocolResult, ViewScore, summarise
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.evaluation.views import EvaluationSpec
 
 __all__ = [
-    "PROTOCOLS", "ClosingTrace", "Disturbance", "EvaluationSpec", "GraspTrial", "LiftTry", "ObjectMotion", "PoseNoise",
-    "Protocol", "ProtocolResult", "PullResult", "PullSpec", "Share", "Truth", "ViewScore", "close_hand",
-    "evaluate", "find_protocol", "lift_grasps", "pull_grasp", "summarise",
-]  # fmt: skip
+    "PROTOCOLS",
+    "ClosingTrace",
+    "Disturbance",
+    "EvaluationSpec",
+    "GraspTrial",
+    "LiftTry",
+    "ObjectMotion",
+    "PoseNoise",
+    "Protocol",
+    "ProtocolResult",
+    "PullResult",
+    "PullSpec",
+    "Share",
+    "Truth",
+    "ViewScore",
+    "evaluate",
+    "find_protocol",
+    "lift_grasps",
+    "pull_grasp",
+    "summarise",
+]

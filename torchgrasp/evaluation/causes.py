@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import checked
-from torchgrasp.closure import ClosureResult
-from torchgrasp.errors import Status
 from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
 from torchgrasp.evaluation.regrasp import LiftTry
 from torchgrasp.evaluation.trial import GraspTrial
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.geometry.mesh import read_mesh
-from torchgrasp.lazy import trimesh
-from torchgrasp.specs import TrialSpec
+from torchgrasp.values.closing import ClosureResult
+from torchgrasp.values.specs import TrialSpec
 
 CAUSES: dict[str, list[str]] = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
 """Causes by name: the unit of the size, and a sentence. The first that applies to a trial is its cause."""

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.closure import ObjectMotion
 from torchgrasp.control import TipContact
-from torchgrasp.errors import Status
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.values.closing import ObjectMotion
 
 SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
 """Motion [m, rad] of the object in the closed hand that counts as slipped."""

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import inverse, rigid
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import GRID, Plane, to_upright
-from torchgrasp.lazy import trimesh
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import torch
 
-from torchgrasp.checks import checked
-from torchgrasp.closure import ClosingOptions
 from torchgrasp.data.shipped import load_object, load_shipped_grasp
 from torchgrasp.evaluation.lift import close_hand
+from torchgrasp.foundation.checks import checked
 from torchgrasp.hand.load import load_hand
-from torchgrasp.specs import Simulator, TrialSpec
+from torchgrasp.values.closing import ClosingOptions
+from torchgrasp.values.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):

@@ -11,26 +11,26 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import map_tensors
-from torchgrasp.checks import Pose, Seed, checked
-from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
 from torchgrasp.cloud.agreement import check_agreement, check_stand
 from torchgrasp.control.reference import check_single
 from torchgrasp.data.shipped import GraspObject
-from torchgrasp.errors import Status
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
+from torchgrasp.foundation.base import map_tensors
+from torchgrasp.foundation.checks import Pose, Seed, checked
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
-from torchgrasp.lazy import trimesh
 from torchgrasp.sim.scene_spec import Neighbour
-from torchgrasp.specs import TrialSpec
-from torchgrasp.threads import single_threaded
-from torchgrasp.values import Grasps
+from torchgrasp.values.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import TrialSpec
 
 LIFT_TIME = 1.0  # time [s] in which the hand rises
 PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre during the closing that counts as ejected

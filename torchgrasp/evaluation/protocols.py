@@ -10,15 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Count, Length, Pose, Range, Seed, check_tensor, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Count, Length, Pose, Range, Seed, check_tensor, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.lazy import trimesh
-from torchgrasp.specs import TrialSpec
 from torchgrasp.success.task import GraspTask
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import TrialSpec
 
 
 @checked

@@ -8,17 +8,17 @@ from typing import Annotated
 import numpy as np
 import torch
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Measured, Range, checked
-from torchgrasp.closure import ObjectMotion
-from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.causes import find_cause
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, draw_push, find_protocol, seed_of
 from torchgrasp.evaluation.regrasp import run_lifts
-from torchgrasp.evaluation.score import ProtocolResult
+from torchgrasp.evaluation.summary import ProtocolResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Measured, Range, checked
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import rotation_angle
-from torchgrasp.threads import single_threaded
+from torchgrasp.values.closing import ObjectMotion
 
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """Directions of the pulls: -x, +x, -y, +y, -z, +z of the world."""

@@ -11,26 +11,26 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.checks import Count, checked
-from torchgrasp.closure import ClosureResult
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.recovery import LiftCheck, Reopening
 from torchgrasp.control.tactile import Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
-from torchgrasp.errors import Status
 from torchgrasp.evaluation.lift import _Lift, run_lift
 from torchgrasp.evaluation.protocols import apply_error, seed_of
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
+from torchgrasp.foundation.checks import Count, checked
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Neighbour
-from torchgrasp.specs import TrialSpec
 from torchgrasp.success.loads import log_odds_about
-from torchgrasp.threads import single_threaded
-from torchgrasp.values import Grasps
+from torchgrasp.values.closing import ClosureResult
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import TrialSpec
 
 
 @checked

@@ -11,8 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Pose, Seed, checked
-from torchgrasp.closure import SensorModel
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding import GripHold
@@ -21,20 +19,22 @@ from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.control.relook import REACH
-from torchgrasp.errors import BadArgument
 from torchgrasp.evaluation.frame import moved_mesh, rounded, to_frame, world_frame
 from torchgrasp.evaluation.protocols import apply_error, seed_of
+from torchgrasp.foundation.checks import Pose, Seed, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.lazy import trimesh
 from torchgrasp.sim.convex_parts import read_solid
-from torchgrasp.sim.scene import Scene
 from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
-from torchgrasp.specs import ClosingMode, TrialSpec
-from torchgrasp.values import Grasps
+from torchgrasp.sim.simulated_scene import SimulatedScene
+from torchgrasp.values.closing import SensorModel
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ClosingMode, TrialSpec
 
 
 @checked
@@ -130,7 +130,7 @@ class TrialDriver:
             mesh, *parts = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
         return Body(mesh, parts, mass)
 
-    def _open_scene(self, spec: SceneSpec) -> Scene:
+    def _open_scene(self, spec: SceneSpec) -> SimulatedScene:
         """Return a fresh scene of a run of the trial."""
         return open_scene(spec, self.spec.simulator)
 

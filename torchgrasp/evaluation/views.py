@@ -14,30 +14,30 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, count_status
-from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.camera import look_at
 from torchgrasp.data import read_entry, read_object_mesh, read_view
 from torchgrasp.data.shards import load_grasps
-from torchgrasp.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
 from torchgrasp.evaluation.protocols import Protocol, draw_error, draw_slide, seed_of
 from torchgrasp.evaluation.pull import run_protocol
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore
+from torchgrasp.evaluation.summary import ProtocolResult, ViewScore
 from torchgrasp.evaluation.trial import GraspTrial, Truth
+from torchgrasp.foundation.base import Value, count_status
+from torchgrasp.foundation.checks import Count, Seed, checked
+from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of, load_hand
-from torchgrasp.lazy import trimesh
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.problem import digest
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.values.planning import Grasps, PointCloud
+from torchgrasp.values.specs import ContactSpec
 
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
 Ranks = Literal["best", "spread"]
@@ -90,7 +90,7 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
+class ObjectView:
     """A hand and a view of an object: the input of one planning task, named by the files of both."""
 
     objects: Path
@@ -121,7 +121,9 @@ class PlannedView(NamedTuple):
     grasps: Grasps | None = None
 
 
-def plan_views(views: Sequence[View], protocol: Protocol, spec: EvaluationSpec, device: str) -> list[Grasps | None]:
+def plan_views(
+    views: Sequence[ObjectView], protocol: Protocol, spec: EvaluationSpec, device: str
+) -> list[Grasps | None]:
     """Plan on several views at once on a device; return the executable grasps of each, or None, for `plan_view`."""
     clouds, planned, where = dict[int, PointCloud](), dict[int, Grasps](), torch.device(device)
     for k, view in enumerate(views):
@@ -137,7 +139,7 @@ def plan_views(views: Sequence[View], protocol: Protocol, spec: EvaluationSpec, 
     return [planned.get(k) for k in range(len(views))]
 
 
-def _plan(cloud: Any, view: View, protocol: Protocol, spec: EvaluationSpec, **more: Any) -> Any:
+def _plan(cloud: Any, view: ObjectView, protocol: Protocol, spec: EvaluationSpec, **more: Any) -> Any:
     """Plan grasps on the cloud of a view, or on several clouds."""
     most_friction = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
     contacts = ContactSpec(friction=min(protocol.trial.friction, most_friction), table=Plane.horizontal(0.0))
@@ -146,7 +148,7 @@ def _plan(cloud: Any, view: View, protocol: Protocol, spec: EvaluationSpec, **mo
 
 
 def plan_view(
-    view: View, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
+    view: ObjectView, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
 ) -> PlannedView:
     """Plan grasps for a protocol on a view, or take those that are `planned`, in a file or by `plan_views`.
 
@@ -192,7 +194,7 @@ def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -
 
 
 def try_grasp(
-    view: View, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
+    view: ObjectView, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
 ) -> ProtocolResult:
     """Try the first grasp of a view in simulation; `at` is its rank and the number of the pose error's draw."""
     hand = hand_of(grasp, view.load_hand())

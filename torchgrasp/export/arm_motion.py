@@ -8,15 +8,15 @@ from torch import Tensor
 
 from torchgrasp.arm.arm import Arm
 from torchgrasp.arm.reach import track, way_of
-from torchgrasp.base import Value
-from torchgrasp.checks import Force, Positive, checked
 from torchgrasp.control.paper.closings import POSE_TIME
-from torchgrasp.errors import BadArgument
 from torchgrasp.export.postures import named_postures
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Force, Positive, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.motion import COARSE_STEPS
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 
 @checked

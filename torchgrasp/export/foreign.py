@@ -13,19 +13,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Length, Poses, checked
-from torchgrasp.cloud.tables import parse_npz
+from torchgrasp.cloud.safe_files import parse_npz
+from torchgrasp.contacts.certify import certify
 from torchgrasp.control.law import damped_inverse
-from torchgrasp.errors import BadArgument, ModelFileError, Status
 from torchgrasp.export.other_formats import bench_frame
 from torchgrasp.files import Field, is_file, read_bytes, read_json
+from torchgrasp.foundation.checks import Length, Poses, checked
+from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
+from torchgrasp.foundation.lazy import spatial
+from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.geometry.frames import apply, rigid, rotate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.lazy import spatial
-from torchgrasp.limits import CLOUD_BYTES
-from torchgrasp.plan.certify import certify
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Contacts, Grasps
+from torchgrasp.values.planning import Contacts, Grasps
+from torchgrasp.values.specs import ContactSpec
 
 MOST_GRASPS = 100_000  # most grasps of a file: more are no plan of one object
 FAR = 10_000.0  # largest number of a pose or posture [mm, rad] in a JSON file

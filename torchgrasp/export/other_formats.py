@@ -15,16 +15,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Force, Positive, checked
-from torchgrasp.errors import BadArgument, Status
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import format_json, write_file
+from torchgrasp.foundation.checks import Force, Positive, checked
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.lazy import matplotlib, spatial, trimesh
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import opened_pose
-from torchgrasp.lazy import matplotlib, spatial, trimesh
 from torchgrasp.shape.surface import Surface
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 BENCH_HANDS = {"allegro": ([1.0, 0.0, 1.0, 0.0], tuple(f"joint_{k}" for k in range(16)))}
 """Hands that DexGraspBench has: rotation (x, y, z, w) of the root link in its hand frame, and joints in its order."""

@@ -12,25 +12,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Positive, checked
 from torchgrasp.control.holding import PUSH
 from torchgrasp.control.paper.closings import POSE_TIME
-from torchgrasp.errors import BadArgument
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import render, write_file
+from torchgrasp.foundation.checks import Positive, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.geometry.frames import inverse, rotation_from_rpy
 from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.urdf import Joint, Link, Shape
+from torchgrasp.hand.urdf import Joint, Link, LinkShape
 from torchgrasp.ik.motion import opened_pose
-from torchgrasp.lazy import spatial, trimesh
 from torchgrasp.shape.surface import Surface
 from torchgrasp.sim.convex_parts import hull, read_solid
 from torchgrasp.sim.mujoco_scene import scene_mjcf
 from torchgrasp.sim.sapien_bodies import split_hull
 from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, SceneSpec, Slide, mounted_urdf, pair_masks
-from torchgrasp.specs import TrialSpec
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import TrialSpec
 
 Player = Literal["mujoco", "maniskill", "newton", "isaaclab", "usd"]
 """The simulators and the scene format for which `save_play` writes a folder."""
@@ -247,7 +247,7 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _pose(of: "Joint | Shape") -> np.ndarray:
+def _pose(of: "Joint | LinkShape") -> np.ndarray:
     """Return the pose (4, 4) of a joint or a shape in its link."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_from_rpy(of.rpy).numpy(), of.xyz

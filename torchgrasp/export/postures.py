@@ -10,18 +10,18 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Force, Pose, Positive, checked
-from torchgrasp.control.forces import Squeeze, squeeze
+from torchgrasp.control.finger_forces import Squeeze, squeeze
 from torchgrasp.control.paper.closings import POSE_TIME
-from torchgrasp.errors import BadArgument, Status
 from torchgrasp.files import format_json
+from torchgrasp.foundation.checks import Force, Pose, Positive, checked
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
-from torchgrasp.lazy import spatial
 from torchgrasp.sim.mujoco_scene import nest_links, render_mjcf
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 CONVENTIONS: dict[str, Any] = json.loads((Path(__file__).parent / "templates" / "conventions.json").read_text("utf-8"))
 """Meaning of the numbers in a JSON file of grasps; the file contains this text."""

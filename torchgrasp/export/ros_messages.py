@@ -9,15 +9,15 @@ import yaml
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import Force, Pose, Positive, checked
 from torchgrasp.control.paper.closings import POSE_TIME
-from torchgrasp.errors import BadArgument
 from torchgrasp.export.arm_motion import ArmMotion
 from torchgrasp.export.postures import named_postures, quaternion, rename_joints
+from torchgrasp.foundation.checks import Force, Pose, Positive, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE, UP, opened_pose
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 OBJECT_FRAME = "object"
 """Name in the messages of the object's frame, which is the frame of the cloud; publish a transform of that name."""

@@ -11,6 +11,6 @@ from torchgrasp.files.write import Malformed as Malformed, explain as explain
 from torchgrasp.files.write import LOCK as LOCK, begin_folder as begin_folder, check_begun as check_begun
 from torchgrasp.files.write import hold_file as hold_file, hold_folder as hold_folder
 from torchgrasp.files.write import template_engine as template_engine, temporary_folder as temporary_folder
-from torchgrasp.files.values import DTYPES as DTYPES, VERSION as VERSION, Field as Field, Recent as Recent
-from torchgrasp.files.values import load_tensors as load_tensors, pack_tensors as pack_tensors
-from torchgrasp.files.values import read_json as read_json, read_value as read_value, save_tensors as save_tensors
+from torchgrasp.files.fields import DTYPES as DTYPES, VERSION as VERSION, Field as Field, Recent as Recent
+from torchgrasp.files.fields import load_tensors as load_tensors, pack_tensors as pack_tensors
+from torchgrasp.files.fields import read_json as read_json, read_value as read_value, save_tensors as save_tensors

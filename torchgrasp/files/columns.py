@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchgrasp.files.write import Malformed
-from torchgrasp.limits import CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMNS
+from torchgrasp.foundation.limits import CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMNS
 
 
 def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from typing import IO, Any
 
 from filelock import FileLock, Timeout
 
-from torchgrasp.errors import BadArgument, OutputError, Status
-from torchgrasp.lazy import jinja2
+from torchgrasp.foundation.errors import BadArgument, OutputError, Status
+from torchgrasp.foundation.lazy import jinja2
 
 Refuse = Callable[[str, str], BadArgument]  # makes an error of what was found and what is allowed
 ENDING = ".part"  # ending of the name under which a file is written; a dot and the name of the file come first

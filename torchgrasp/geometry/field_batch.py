@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import kept
+from torchgrasp.foundation.base import kept
 from torchgrasp.geometry.signed_distance import DistanceField, Grid, SignedDistanceField, corner_steps
 
 

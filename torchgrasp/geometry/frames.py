@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.errors import DegenerateContacts
+from torchgrasp.foundation.errors import DegenerateContacts
+from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.marks import is_known
 
 
 def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:

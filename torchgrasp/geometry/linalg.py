@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.errors import IndefiniteCovariance
-from torchgrasp.lazy import sparse
-from torchgrasp.marks import is_known
+from torchgrasp.foundation.errors import IndefiniteCovariance
+from torchgrasp.foundation.lazy import sparse
+from torchgrasp.foundation.rules import is_known
 
 Points = Float[Tensor, "n 3"]
 Vector = Float[Tensor, "3"]

@@ -11,10 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.errors import MeshError, SuspiciousScale
 from torchgrasp.files import Malformed, explain, is_file, read_bytes
-from torchgrasp.lazy import trimesh
-from torchgrasp.limits import MAX_EXTENT, MESH_BYTES, MESH_FACES, MIN_EXTENT, PLY_HEADER_BYTES, PLY_PROPERTIES
+from torchgrasp.foundation.errors import MeshError, SuspiciousScale
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.limits import (
+    MAX_EXTENT,
+    MESH_BYTES,
+    MESH_FACES,
+    MIN_EXTENT,
+    PLY_HEADER_BYTES,
+    PLY_PROPERTIES,
+)
 
 SUFFIXES = (".obj", ".off", ".ply", ".stl")  # formats whose memory is bounded by the size of the file
 _REFERENCE = re.compile(rb"/\S*")  # normal and texture of a corner in an .obj: two textures would open the surface

@@ -1,6 +1,6 @@
 """Levenberg-Marquardt for a batch of small problems; each problem has its own state and damping.
 
-`levenberg_marquardt` is the loop. A `Problem` defines steps and their acceptance. See Nocedal and Wright, Numerical
+`levenberg_marquardt` is the loop. A `Minimisation` defines steps and their acceptance. See Nocedal and Wright, Numerical
 Optimization, ch. 10.
 """
 
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, named_tensors, pick, put
+from torchgrasp.foundation.base import Batch, named_tensors, pick, put
 
 SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
 
@@ -35,7 +35,7 @@ State = TypeVar("State", bound=Batch)
 Model = TypeVar("Model", bound=Linearisation)
 
 
-class Problem(abc.ABC, Generic[State, Model]):
+class Minimisation(abc.ABC, Generic[State, Model]):
     """A batch of minimisation problems: their costs, their steps, and the rule by which a step is accepted."""
 
     first_damping: float = 1e-2
@@ -62,7 +62,9 @@ class Problem(abc.ABC, Generic[State, Model]):
 
 
 @torch.no_grad()
-def levenberg_marquardt(problem: Problem[State, Model], state: State, steps: int) -> tuple[State, Float[Tensor, "b"]]:
+def levenberg_marquardt(
+    problem: Minimisation[State, Model], state: State, steps: int
+) -> tuple[State, Float[Tensor, "b"]]:
     """Minimise every problem of a batch by damped Gauss-Newton steps; return final states and costs.
 
     Every problem takes at most `steps` steps, each with one evaluation. No gradient flows through the minimisation.
@@ -105,7 +107,7 @@ class LinearResiduals(Linearisation):
 
 
 @dataclasses.dataclass(frozen=True)
-class LeastSquares(Problem[State, LinearResiduals]):
+class LeastSquares(Minimisation[State, LinearResiduals]):
     """A batch of least-squares problems: the cost is the sum of squared residuals."""
 
     residuals: Callable[[State, Int[Tensor, "a"]], Residuals]  # with Jacobian, of the problems with given indices

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import SomeValue, Value, map_tensors
-from torchgrasp.checks import Pose, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import SomeValue, Value, map_tensors
+from torchgrasp.foundation.checks import Pose, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import unit
 

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector
-from torchgrasp.lazy import spatial
 
 NOISE, NOISE_GROWTH = 0.001, 0.0035
 """Assumed noise [m] of a depth camera, and its growth with the squared distance [1/m]."""
@@ -25,7 +25,7 @@ def assume_noise(points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None) -
     return NOISE + NOISE_GROWTH * (squared if eye is None else (points - eye).square().sum(-1))
 
 
-class View:
+class SeenPoints:
     """One view: points [m] about their centre, their noise [m], camera position `eye`, upward direction `sky`."""
 
     def __init__(self, points: Points, eye: Vector | None, sky: Vector | None) -> None:
@@ -42,7 +42,7 @@ class PlaneFit:
     scale: float
     count: int
 
-    def turned_up(self, view: "View") -> "PlaneFit":
+    def turned_up(self, view: "SeenPoints") -> "PlaneFit":
         """Return the plane with its normal turned up, else towards the camera, else to the side with most points."""
         if view.sky is not None:
             side = float(self.normal @ view.sky)
@@ -53,7 +53,7 @@ class PlaneFit:
         return self if side >= 0 else dataclasses.replace(self, normal=-self.normal, offset=-self.offset)
 
 
-def fit_planes(view: View, generator: torch.Generator) -> Iterator[PlaneFit]:
+def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFit]:
     """Yield at most 8 planes, each with the most points that lie on no plane before it."""
     scored = 2000  # points that score the proposals
     points, noise = view.points[:scored], view.noise[:scored]
@@ -70,7 +70,9 @@ def fit_planes(view: View, generator: torch.Generator) -> Iterator[PlaneFit]:
         left = left * ((points @ fit.normal - fit.offset).abs() > 3 * noise) * (1 - held[i])
 
 
-def _propose(view: View, scored: int, generator: torch.Generator) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
+def _propose(
+    view: SeenPoints, scored: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
     """Return unit normals and offsets [m] of planes through random triples of points, distant or neighbouring."""
     points = view.points
     some = points[:scored]
@@ -100,7 +102,7 @@ def _held(
     return held
 
 
-def _refine(view: View, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
+def _refine(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
     """Refine a plane by iterated least squares with Tukey's weights, which change smoothly with the points."""
     points, noise, scale = view.points, view.noise, 1.0
     for _ in range(30):

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, kept
-from torchgrasp.checks import Range, check_tensor, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, kept
+from torchgrasp.foundation.checks import Range, check_tensor, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.geometry.mesh import closest_on_triangles
-from torchgrasp.lazy import spatial, trimesh
 
 BAND = 0.026  # distance [m] within which every second node is exact: the reach of a palm's spheres
 NEAR, INWARD = 3, 5  # spacings outside and inside the surface within which every node is exact

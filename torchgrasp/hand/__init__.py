@@ -2,12 +2,21 @@
 
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
-from torchgrasp.hand.hand import Actuator, Hand, HandSource
+from torchgrasp.hand.hand import Actuator, HandSource
 from torchgrasp.hand.kinematics import KinematicTree
-from torchgrasp.hand.load import find_hand, hand_of, hands_folder, load_hand, with_fingers
+from torchgrasp.hand.load import find_hand, hand_of, hands_folder, with_fingers
 from torchgrasp.hand.self_collision import SelfCollision
 
 __all__ = [
-    "ActuatedJoints", "Actuator", "CollisionSpheres", "Fingertips", "Hand", "HandSource", "KinematicTree",
-    "SelfCollision", "find_hand", "hand_of", "hands_folder", "load_hand", "with_fingers",
-]  # fmt: skip
+    "ActuatedJoints",
+    "Actuator",
+    "CollisionSpheres",
+    "Fingertips",
+    "HandSource",
+    "KinematicTree",
+    "SelfCollision",
+    "find_hand",
+    "hand_of",
+    "hands_folder",
+    "with_fingers",
+]

@@ -15,14 +15,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, check_whole
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, check_whole
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.limits import HAND_SEPARATIONS, HAND_SHAPE_PAIRS
 from torchgrasp.geometry.frames import real, rotation_from_rpy
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.self_collision import SelfCollision
-from torchgrasp.hand.urdf import Mimic, Shape, Triple, Urdf
-from torchgrasp.limits import HAND_SEPARATIONS, HAND_SHAPE_PAIRS
+from torchgrasp.hand.urdf import LinkShape, Mimic, Triple, Urdf
 
 MEETING_DISTANCE = 0.002  # links that come nearer than this [m] in some posture are a pair to test
 ALWAYS = 0.98  # links that overlap in a larger share of the postures overlap by construction: they are no pair to test
@@ -68,7 +68,7 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
     return CollisionSpheres(link_index, real(center), real(radius), finger, touching)
 
 
-def cover(shape: Shape, cell: float, bulge: float) -> tuple[list[Triple], float]:
+def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], float]:
     """Return the centres and the radius [m] of spheres that cover a shape, one for each cell of about size `cell`."""
     single_layer = 0.025  # a shape thinner than this [m] has one layer of cells across
     if shape.kind == "sphere":
@@ -123,7 +123,7 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
     )
 
 
-def _parts(shape: Shape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
+def _parts(shape: LinkShape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
     """Return rotation, centre, half sizes and radius [m] of each box or sphere of a shape; a cylinder is six boxes."""
     rotation = rotation_from_rpy(shape.rpy)
     if shape.kind == "sphere":

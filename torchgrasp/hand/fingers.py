@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, check_device, kept
-from torchgrasp.checks import ANY, checked, is_known
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, check_device, kept
+from torchgrasp.foundation.checks import ANY, checked, is_known
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import real
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf

@@ -11,14 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value, kept
-from torchgrasp.checks import Count, Range, check_moved, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, kept
+from torchgrasp.foundation.checks import Count, Range, check_moved, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import pytorch_kinematics
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
 from torchgrasp.hand.kinematics import FreeMotion, KinematicTree, chain_poses, map_directions, map_points
 from torchgrasp.hand.self_collision import SelfCollision
-from torchgrasp.lazy import pytorch_kinematics
 
 
 class Actuator(NamedTuple):
@@ -159,7 +159,7 @@ class Hand(Value):
         >>> hand.check_joints(hand.upper + 1)
         Traceback (most recent call last):
             ...
-        torchgrasp.errors.BadArgument: joints: expected a number in [0, 3.14159], got 4.14159 for spread
+        torchgrasp.foundation.errors.BadArgument: joints: expected a number in [0, 3.14159], got 4.14159 for spread
         """
         self.actuated.check_limits(joints)
         return joints

@@ -9,11 +9,11 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchgrasp.base import FINGERTIPS
-from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.files import Field, read_bounded
+from torchgrasp.foundation.base import FINGERTIPS
+from torchgrasp.foundation.errors import BadArgument, HandFileError
+from torchgrasp.foundation.limits import HAND_SHAPE_PAIRS, TOML_BYTES, XML_LETTERS
 from torchgrasp.hand.urdf import Mimic, Triple
-from torchgrasp.limits import HAND_SHAPE_PAIRS, TOML_BYTES, XML_LETTERS
 
 if sys.version_info >= (3, 11):
     import tomllib

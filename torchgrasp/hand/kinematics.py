@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import checked, is_known
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import checked, is_known
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import pytorch_kinematics
 from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy, skew
 from torchgrasp.hand.urdf import Urdf
-from torchgrasp.lazy import pytorch_kinematics
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

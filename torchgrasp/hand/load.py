@@ -3,8 +3,8 @@
 import hashlib
 from pathlib import Path
 
-from torchgrasp.checks import checked
-from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.geometry.frames import real
 from torchgrasp.hand.collision_shapes import self_collision_from_urdf, spheres_from_urdf
 from torchgrasp.hand.fingers import joints_from_files, tips_from_files
@@ -12,7 +12,7 @@ from torchgrasp.hand.hand import Actuator, Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
 from torchgrasp.hand.kinematics import chain_from_urdf, tree_from_urdf
 from torchgrasp.hand.urdf import Urdf, read_urdf
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 
 def hands_folder() -> Path:

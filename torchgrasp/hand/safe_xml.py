@@ -10,8 +10,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-from torchgrasp.errors import HandFileError
-from torchgrasp.limits import XML_DEPTH, XML_ELEMENTS, XML_LETTERS
+from torchgrasp.foundation.errors import HandFileError
+from torchgrasp.foundation.limits import XML_DEPTH, XML_ELEMENTS, XML_LETTERS
 
 IGNORED = {"material", "transmission", "gazebo", "ros2_control", "mujoco", "sensor"}
 """Elements of a robot, besides links and joints, that are left out."""

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, kept
-from torchgrasp.checks import Range, checked, is_known
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, kept
+from torchgrasp.foundation.checks import Range, checked, is_known
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.kinematics import map_points
 
 Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]  # largest separation [m] that is needed exactly

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchgrasp.checks import checked
-from torchgrasp.errors import HandFileError
 from torchgrasp.files import read_bounded
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import HandFileError
+from torchgrasp.foundation.lazy import yourdfpy
+from torchgrasp.foundation.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 from torchgrasp.hand.safe_xml import DEGREES, SIZES, parse_urdf
-from torchgrasp.lazy import yourdfpy
-from torchgrasp.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
 
 REPAIR = "(torchgrasp hand new writes a clean copy)"
 """The end of an error about a published URDF that the library cannot use as it is."""
@@ -35,7 +35,7 @@ class Mimic(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
+class LinkShape:
     """A collision shape of a link: box, sphere, cylinder or mesh.
 
     `size` is (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]; the scale of a mesh.
@@ -63,7 +63,7 @@ class Link:
     mass: float
     com: Triple
     inertia: tuple[float, ...]
-    shapes: tuple[Shape, ...]
+    shapes: tuple[LinkShape, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,10 +180,12 @@ def _link(link: Any, element: ET.Element) -> Link:
     return Link(link.name, body.mass, com, tuple((turn @ inertia @ turn.T)[np.triu_indices(3)].tolist()), shapes)
 
 
-def _shape(collision: Any, element: ET.Element) -> Shape:
+def _shape(collision: Any, element: ET.Element) -> LinkShape:
     kind, shape = next((kind, shape) for kind, shape in vars(collision.geometry).items() if shape is not None)
     size = [float(x) for key in SIZES[kind] for x in np.atleast_1d(getattr(shape, key))]
-    return Shape(kind, tuple(size), *_place(collision.origin, element.find("origin")), getattr(shape, "filename", ""))
+    return LinkShape(
+        kind, tuple(size), *_place(collision.origin, element.find("origin")), getattr(shape, "filename", "")
+    )
 
 
 def _joint(joint: Any, element: ET.Element) -> Joint:

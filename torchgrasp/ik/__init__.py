@@ -11,10 +11,17 @@ from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.joint import solve_joint
 from torchgrasp.ik.motion import opened_pose
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
-from torchgrasp.ik.solve import IKSolution, solve_ik
-from torchgrasp.values import IKSeeds
+from torchgrasp.ik.solve import IKSolution
+from torchgrasp.values.planning import IKSeeds
 
 __all__ = [
-    "CollisionWorld", "GraspProblem", "IKSeeds", "IKSolution", "Obstacles", "PostureLibrary", "nearest_postures",
-    "opened_pose", "solve_ik", "solve_joint",
-]  # fmt: skip
+    "CollisionWorld",
+    "GraspProblem",
+    "IKSeeds",
+    "IKSolution",
+    "Obstacles",
+    "PostureLibrary",
+    "nearest_postures",
+    "opened_pose",
+    "solve_joint",
+]

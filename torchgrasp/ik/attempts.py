@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, at_once, join, lexical_order, map_tensors, rank_in_group
-from torchgrasp.checks import checked
-from torchgrasp.errors import Status
+from torchgrasp.foundation.base import Batch, at_once, join, lexical_order, map_tensors, rank_in_group
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
@@ -26,7 +26,7 @@ from torchgrasp.ik.candidates import (
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import ITERATIONS, grasp_residuals, refine, tip_targets
-from torchgrasp.values import Contacts, Grasps, IKSeeds
+from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
 Result = TypeVar("Result", bound=Batch)
 ANGLE = 0.01  # unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances

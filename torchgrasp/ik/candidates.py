@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value
-from torchgrasp.checks import ANY, Length, Rows, checked, show
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.contacts.feasibility import first_violation
+from torchgrasp.foundation.base import Batch, Value
+from torchgrasp.foundation.checks import ANY, Length, Rows, checked, show
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
@@ -19,8 +20,7 @@ from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import find_approach, motion_clearance, opened_pose
 from torchgrasp.ik.refine import open_hand, tip_targets
-from torchgrasp.plan.feasibility import first_violation
-from torchgrasp.values import Certificate, Contacts, Grasps, IKSeeds
+from torchgrasp.values.planning import Certificate, Contacts, Grasps, IKSeeds
 
 Reachable = Callable[[Tensor], Tensor]
 """A user's function that takes hand poses in the object's frame (k, 4, 4), and returns which an arm reaches (k,)."""

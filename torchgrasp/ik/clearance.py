@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, settle
-from torchgrasp.checks import Range, checked
+from torchgrasp.foundation.base import Value, settle
+from torchgrasp.foundation.checks import Range, checked
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.signed_distance import DistanceField, SignedDistanceField
 from torchgrasp.hand.collision_shapes import CollisionSpheres
-from torchgrasp.ik.configuration import Rows, SpatialJacobian
+from torchgrasp.ik.configuration import ResidualRows, SpatialJacobian
 from torchgrasp.scene.occupancy import Occupancy
 
 MILLIMETRE = 1e-3  # unit [m] of all residuals
@@ -154,18 +154,18 @@ def collision_cost(
     return cost / MILLIMETRE**2
 
 
-def clearance_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
+def clearance_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[ResidualRows]:
     """Return residuals [mm]: the lack of the smallest clearances between links and from object, obstacles and table."""
     pairs, moves = spatial.hand.self_collision, spatial.hand.motion.moves
     separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
     separation, index = separation.T.topk(min(HINGES, len(pairs.pairs)), dim=1, largest=False, sorted=False)
     wrench = wrench.T[number.T.gather(1, index)] / -MILLIMETRE
     first, second = moves[pairs.link[pairs.pairs]].to(wrench).unbind(1)
-    between = Rows((SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE, wrench, (second - first)[index])
+    between = ResidualRows((SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE, wrench, (second - first)[index])
     return [between, *sphere_rows(spatial, world, tips_touch)]
 
 
-def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Rows]:
+def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[ResidualRows]:
     """Return the residuals of `clearance_rows` for the clearances of the links from object, obstacles and table."""
     spheres, motion, centres = spatial.hand.collision_spheres, spatial.hand.motion, spatial.sphere_centres
     radius, found = spheres.radius.to(centres), []
@@ -193,7 +193,7 @@ def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: boo
     direction = direction * ((clearance < CLEARANCE).to(centres) / -MILLIMETRE)[..., None]
     wrench = torch.cat([direction, torch.linalg.cross(points.flatten(1, 2), direction)], -1)
     moves = motion.moves[spheres.link_index].to(centres)[index.flatten(1)]
-    return [Rows((CLEARANCE - clearance).clamp_min(0) / MILLIMETRE, wrench, moves)]
+    return [ResidualRows((CLEARANCE - clearance).clamp_min(0) / MILLIMETRE, wrench, moves)]
 
 
 def link_clearance(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Float[Tensor, "g"]]:

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value
-from torchgrasp.checks import Poses, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Batch, Value
+from torchgrasp.foundation.checks import Poses, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.optim import Residuals
 from torchgrasp.hand.hand import Hand
@@ -43,7 +43,7 @@ class Configuration(Batch):
         return Configuration(joints, rigid(rotation @ rotation_from_vector(step[:, 3:6]), position))
 
 
-class Rows(NamedTuple):
+class ResidualRows(NamedTuple):
     """Residuals of g configurations, with the factors of their derivatives by q motions of joints and hand pose.
 
     The derivative by a motion is `wrench` times the twist of the motion where `moves` is 1, and 0 where `moves` is 0.
@@ -84,13 +84,13 @@ class SpatialJacobian(Value):
         return self.spheres.permute(2, 1, 0)
 
     def jacobian(self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of k residuals by hand pose (6) and joints; the arguments are fields of `Rows`."""
+        """Return the derivatives of k residuals by hand pose (6) and joints; the arguments are fields of `ResidualRows`."""
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling
         return by_motion if coupling is None else by_motion @ coupling.to(by_motion)
 
 
-def differentiate(spatial: SpatialJacobian, parts: Sequence[Rows]) -> Residuals:
+def differentiate(spatial: SpatialJacobian, parts: Sequence[ResidualRows]) -> Residuals:
     """Concatenate several groups of residuals; return them and their Jacobian by hand pose (6) and joints."""
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     return residual, spatial.jacobian(wrench, moves)

@@ -12,8 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, at_once, rank_in_group, spread
-from torchgrasp.checks import checked
+from torchgrasp.contacts.certify import certify
+from torchgrasp.contacts.feasibility import FlatnessConstraint, check_feasibility, flatness_constraint
+from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of, triple_jet, triple_mean_jet
+from torchgrasp.contacts.solver import equal_tensions, normalise_tensions, project
+from torchgrasp.foundation.base import Batch, at_once, rank_in_group, spread
+from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.attempts import Attempts, assign, best_first, best_grasps, try_best_seeds
@@ -21,18 +25,14 @@ from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candid
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
 from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
-from torchgrasp.plan.certify import certify
-from torchgrasp.plan.feasibility import FlatnessConstraint, check_feasibility, flatness_constraint
-from torchgrasp.plan.problem import ContactProblem, Shape, rows_of, triple_jet, triple_mean_jet
-from torchgrasp.plan.solver import equal_tensions, normalise_tensions, project
-from torchgrasp.shape.values import SurfaceJet
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Contacts, Grasps, IKSeeds
+from torchgrasp.shape.estimate import SurfaceJet
+from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
+from torchgrasp.values.specs import ContactSpec
 
 CONTACT_WEIGHT = 2.0  # weight of a millimetre of the contact problem: contacts have no margins
 
 
-class Stage(NamedTuple):
+class SlidingStage(NamedTuple):
     """A solver stage: its steps, whether contacts must be on flat surface, largest cost [mm2] of grasps that go on."""
 
     steps: int
@@ -40,7 +40,12 @@ class Stage(NamedTuple):
     hopeless: float
 
 
-STAGES = (Stage(5, False, 1e5), Stage(6, True, 1e4), Stage(7, True, 500.0), Stage(8, True, 50.0))
+STAGES = (
+    SlidingStage(5, False, 1e5),
+    SlidingStage(6, True, 1e4),
+    SlidingStage(7, True, 500.0),
+    SlidingStage(8, True, 50.0),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +73,7 @@ class JointProblem:
     """The least-squares problem of hand and contacts together: hand, object shape, constraints, collision world."""
 
     hand: Hand
-    shape: Shape
+    shape: ShapeLike
     contact_problem: ContactProblem
     world: CollisionWorld
 
@@ -169,7 +174,7 @@ def solve_sliding(
 
 
 @checked
-def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: Shape, spec: ContactSpec) -> Grasps:
+def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec) -> Grasps:
     """Optimise a hand posture for each contact set that has seeds; return the checked grasps, best first.
 
     Seeds are tried in their order. If the hand cannot reach the contacts, they slide along the surface and are

@@ -6,15 +6,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import spread
-from torchgrasp.checks import checked
+from torchgrasp.foundation.base import spread
+from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles, along
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 APPROACH_DISTANCE = 0.1  # length [m] of the straight approach: about the depth of a hand
 COARSE_STEPS, FINE_STEPS = 8, 16  # positions on each candidate path, and on a chosen path

@@ -11,8 +11,8 @@ from torch import Tensor
 from torchgrasp.geometry.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along, clearance_rows
-from torchgrasp.ik.configuration import Configuration, Rows, SpatialJacobian, differentiate
-from torchgrasp.values import Contacts
+from torchgrasp.ik.configuration import Configuration, ResidualRows, SpatialJacobian, differentiate
+from torchgrasp.values.planning import Contacts
 
 TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0  # weights of a millimetre at a tip, and of a cosine outside the pad's cone
 HAND_STEP = 0.6  # largest step of a pose or a joint [m or rad]
@@ -24,7 +24,7 @@ def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
 
-def tip_rows(spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]) -> Rows:
+def tip_rows(spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]) -> ResidualRows:
     """Return the fingertips' residuals: three for each tip's position error, then one for each contact direction."""
     tips, motion, g = spatial.hand.tips, spatial.hand.motion, len(target)
     centres, pads = spatial.tips.permute(2, 1, 0), spatial.pads.permute(2, 1, 0)
@@ -36,7 +36,7 @@ def tip_rows(spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: 
     residual = torch.cat([(TIP_WEIGHT / MILLIMETRE) * (centres - target).flatten(1), weight * outside], 1)
     wrench = torch.cat([pulls, torch.cat([torch.zeros_like(turns), turns], -1)], 1)
     moves = motion.moves[torch.cat([tips.index.repeat_interleave(3), tips.index])].to(pads)
-    return Rows(residual, wrench, moves.expand(g, -1, -1))
+    return ResidualRows(residual, wrench, moves.expand(g, -1, -1))
 
 
 def grasp_residuals(

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, at_once, check_device, check_whole, join, lexical_order, settle
-from torchgrasp.checks import Count, Positive, Seed, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, at_once, check_device, check_whole, join, lexical_order, settle
+from torchgrasp.foundation.checks import Count, Positive, Seed, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
@@ -20,7 +20,7 @@ from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
 from torchgrasp.ik.refine import TIP_WEIGHT
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, check_compatible, encode
 from torchgrasp.posture_model.sample import sample_configurations
-from torchgrasp.values import Contacts, IKSeeds
+from torchgrasp.values.planning import Contacts, IKSeeds
 
 Wanted = Float[Tensor, "r p d"]
 Given = Float[Tensor, "s d"]

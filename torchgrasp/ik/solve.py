@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, join, pick, rank_in_group, settle
-from torchgrasp.checks import ANY, check_tensor, checked
-from torchgrasp.errors import Status
+from torchgrasp.foundation.base import Batch, join, pick, rank_in_group, settle
+from torchgrasp.foundation.checks import ANY, check_tensor, checked
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.attempts import Attempts, assign, refine_by_cobyla
@@ -23,8 +24,7 @@ from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import refine
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures, query_mixture
 from torchgrasp.posture_model.mixture import GraspMixture
-from torchgrasp.threads import single_threaded
-from torchgrasp.values import Contacts, IKSeeds
+from torchgrasp.values.planning import Contacts, IKSeeds
 
 Method = Literal["levenberg_marquardt", "cobyla"]
 EXACT = 1e-6  # sum of squared residuals [mm2] at which a seed is done

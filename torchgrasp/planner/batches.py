@@ -10,24 +10,24 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from torchgrasp.base import join
-from torchgrasp.errors import Status
+from torchgrasp.contacts.resist import resist_loads
+from torchgrasp.foundation.base import join
+from torchgrasp.foundation.errors import Status
 from torchgrasp.ik.attempts import Attempts, best_grasps, executable, solve_as_paper, solve_contact_first
 from torchgrasp.ik.joint import solve_sliding, try_best_seeds
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.ik.refine import ITERATIONS
-from torchgrasp.plan.resist import resist_loads
 from torchgrasp.planner.contacts import Pool, SeededContacts, contact_costs, find_contacts, join_seeded
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.report import Report
 from torchgrasp.planner.schedule import OFFERED
 from torchgrasp.planner.stack import Owner, Stack, by_cloud
-from torchgrasp.specs import Ranking
 from torchgrasp.success.features import measure_grasps
 from torchgrasp.success.loads import strength_of
-from torchgrasp.success.model import load_model
-from torchgrasp.success.order import by_success, grade, is_known, keep_promise, rank_by_variance
-from torchgrasp.values import ContactPlan, Grasps
+from torchgrasp.success.model import load_success_model
+from torchgrasp.success.order import by_success, grade, is_covered, keep_promise, rank_by_variance
+from torchgrasp.values.planning import ContactPlan, Grasps
+from torchgrasp.values.specs import Ranking
 
 
 def plan_hand(problem: Problem, deadline: float) -> Iterator[Grasps]:
@@ -223,11 +223,11 @@ def rank(stack: Stack, solved: Owned) -> list[Grasps]:
     rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
     good, body = grasps[rows], stack.body.rows(solved.owner[rows])
     features = measure_grasps(hand, body, good, spec.friction, task, task.lifts(spec.plane))
-    log_odds = load_model(features.device).log_odds(features)
+    log_odds = load_success_model(features.device).log_odds(features)
     if problem.obstacles is not None:
         free = 1 - collision_probability(hand, good, problem.obstacles, spec.plane).to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=1e-6)
-    known, owner = is_known(features), solved.owner
+    known, owner = is_covered(features), solved.owner
     if len(stack) > 1:  # the host sorts
         cpu = torch.device("cpu")
         grasps, log_odds, known, owner, rows = grasps.to(cpu), log_odds.cpu(), known.cpu(), owner.cpu(), rows.cpu()

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
-from torchgrasp.errors import Status
+from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.planner.problem import take_target
 from torchgrasp.planner.request import Request, finger_sets

@@ -8,18 +8,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import join, lexical_order, rank_in_group
-from torchgrasp.checks import Count, checked
-from torchgrasp.errors import Status
+from torchgrasp.contacts.certify import certify
+from torchgrasp.contacts.resist import resist_loads
+from torchgrasp.foundation.base import join, lexical_order, rank_in_group
+from torchgrasp.foundation.checks import Count, checked
+from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.ik.attempts import assign, seed_costs
 from torchgrasp.ik.seeds import nearest_postures, query_mixture
-from torchgrasp.plan.certify import certify
-from torchgrasp.plan.resist import resist_loads
 from torchgrasp.planner.stack import Owner, Stack, by_cloud
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
-from torchgrasp.success.loads import load_arm, strength_of
-from torchgrasp.values import Certificate, ContactPlan, Contacts, IKSeeds
+from torchgrasp.success.loads import lever_arm, strength_of
+from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, IKSeeds
 
 LIKELY = 2
 """Farthest-point sampling takes n contact sets from the `LIKELY` * n sets with the lowest cost."""
@@ -215,7 +215,7 @@ def contact_costs(stack: Stack, found: SeededContacts) -> tuple[SeededContacts, 
     residual = seed_costs(stack.reach(contacts, certificate, owner), first)
     least = torch.full((len(contacts),), torch.inf, dtype=residual.dtype, device=residual.device)
     least = least.scatter_reduce(0, first.row, residual, "amin")
-    arm = load_arm(contacts.points, stack.body.rows(owner).center)
+    arm = lever_arm(contacts.points, stack.body.rows(owner).center)
     return found._replace(seeds=seeds), least.clamp_min(1e-3).log() + 0.3 * (arm + 0.1).log() + weak
 
 

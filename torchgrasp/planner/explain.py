@@ -13,19 +13,19 @@ from jaxtyping import Int
 from torch import Tensor
 from typing_extensions import Unpack
 
-from torchgrasp.base import Value, count_status
-from torchgrasp.checks import Count, Seed, checked
 from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
-from torchgrasp.errors import Status
+from torchgrasp.foundation.base import Value, count_status
+from torchgrasp.foundation.checks import Count, Seed, checked
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.planner.batches import Planner, rank_together
 from torchgrasp.planner.changes import Change, list_changes, more_starts
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.request import Observer, PlanOptions, Request, show_options
 from torchgrasp.planner.run import expected_success
 from torchgrasp.planner.stack import Stack
-from torchgrasp.specs import ContactSpec
-from torchgrasp.threads import single_threaded
-from torchgrasp.values import Certificate, ContactPlan, Grasps, IKSeeds
+from torchgrasp.values.planning import Certificate, ContactPlan, Grasps, IKSeeds
+from torchgrasp.values.specs import ContactSpec
 
 MOST_TRIALS = 8  # most changes that are tried
 

@@ -7,18 +7,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.checks import checked
 from torchgrasp.cloud.check import FEW_POINTS
-from torchgrasp.errors import Status
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.plane import to_upright, upright_frame
-from torchgrasp.geometry.support import find_table
+from torchgrasp.geometry.support_planes import find_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
 from torchgrasp.scene.segment import OVERHANG
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
 from torchgrasp.success.order import largest_known
+from torchgrasp.values.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
 
 
 @checked

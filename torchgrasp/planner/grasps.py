@@ -5,15 +5,15 @@ from typing import Annotated, overload
 
 from typing_extensions import Unpack
 
-from torchgrasp.checks import Count, Range, Seed, checked
 from torchgrasp.data.accept import CloudLike, HandLike, SeenLike, as_cloud, as_hand, as_seen
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.checks import Count, Range, Seed, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.planner.many import plan_many
 from torchgrasp.planner.request import PlanOptions, Request, show_options
 from torchgrasp.planner.run import plan_request, stream_request
-from torchgrasp.specs import ContactSpec
-from torchgrasp.threads import single_threaded
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ContactSpec
 
 
 @overload

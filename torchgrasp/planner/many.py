@@ -12,16 +12,16 @@ from typing import Any, TypeVar
 
 import torch
 
-from torchgrasp.checks import checked
-from torchgrasp.errors import BadArgument, GraspError, MissingExtra, Status
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, Status
+from torchgrasp.foundation.jobs import pack, run_tasks, unpack
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
-from torchgrasp.jobs import pack, run_tasks, unpack
 from torchgrasp.planner.batches import plan_hands
 from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import finish, plan_request
-from torchgrasp.values import Certificate, Contacts, Grasps, PointCloud
+from torchgrasp.values.planning import Certificate, Contacts, Grasps, PointCloud
 
 Result = TypeVar("Result")
 

@@ -12,22 +12,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.arm.reach import reach_poses, with_arm
-from torchgrasp.base import settle
-from torchgrasp.checks import Seed, checked
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat
-from torchgrasp.errors import BadArgument
+from torchgrasp.contacts.region import seen_from
+from torchgrasp.contacts.starts import FlatCandidates, check_starts, drawn_starts, settle_flatness, start_chunks
 from torchgrasp.files import sha256
+from torchgrasp.foundation.base import settle
+from torchgrasp.foundation.checks import Seed, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, round_upright, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.motion import lift_clearance
-from torchgrasp.plan.region import seen_from
-from torchgrasp.plan.starts import Settled, check_starts, chunk_sizes, drawn_starts, settle_flatness
 from torchgrasp.planner.request import Request
-from torchgrasp.planner.schedule import TRIED, TRIED_IN_SCENE, Batch, schedule
+from torchgrasp.planner.schedule import TRIED, TRIED_IN_SCENE, BatchSize, schedule
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
 from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.scene.scene import Scene
@@ -35,11 +35,11 @@ from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.shape.fit import FitOptions, fit_upright
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
-from torchgrasp.specs import ContactSpec
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.promise import describe_promise
 from torchgrasp.success.task import loads_of
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.values.planning import Grasps, PointCloud
+from torchgrasp.values.specs import ContactSpec
 
 TARGET_POINTS = 1000  # most points of a scene's target that are used: they lie a few millimetres apart
 
@@ -109,7 +109,7 @@ class Problem:
         return problem
 
     @cached_property
-    def flat(self) -> Settled:
+    def flat(self) -> FlatCandidates:
         """The contact constraints, with the radius on which a contact must be flat, and the flat candidate contacts."""
         table, region = None if self.given_spec.table is None else 0.0, self.given_spec.region
         spec = dataclasses.replace(self.given_spec, table=table, region=seen_from(region, self.obj_from_upright))
@@ -119,14 +119,14 @@ class Problem:
         return settle_flatness(self.shape, spec, self.request.seed)
 
     @cached_property
-    def batches(self) -> list[Batch]:
+    def batches(self) -> list[BatchSize]:
         """The batches of the plan; only mode "joint" has more than one."""
         most, request = TRIED if self.scene is None else TRIED_IN_SCENE, self.request
-        return schedule(request.starts, most) if request.mode == "joint" else [Batch(request.starts, most)]
+        return schedule(request.starts, most) if request.mode == "joint" else [BatchSize(request.starts, most)]
 
     def draw(self) -> Iterator[Float[Tensor, "_ f 3"]]:
-        """Yield the initial guesses of all batches, in chunks (`chunk_sizes`)."""
-        sizes = (size for batch in self.batches for size in chunk_sizes(batch.starts))
+        """Yield the initial guesses of all batches, in chunks (`start_chunks`)."""
+        sizes = (size for batch in self.batches for size in start_chunks(batch.starts))
         return drawn_starts(self.shape, self.flat, sizes, self.request.seed)
 
     @cached_property

@@ -5,12 +5,12 @@ from typing import Any
 
 import torch
 
-from torchgrasp.base import count_status, join
-from torchgrasp.errors import Status
+from torchgrasp.foundation.base import count_status, join
+from torchgrasp.foundation.errors import Status
 from torchgrasp.ik.attempts import executable
 from torchgrasp.planner.problem import Problem
-from torchgrasp.shape.values import surface_deviation
-from torchgrasp.values import Grasps, format_success
+from torchgrasp.shape.estimate import surface_deviation
+from torchgrasp.values.planning import Grasps, format_success
 
 
 class Report:

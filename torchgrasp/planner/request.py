@@ -10,18 +10,18 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypedDict, TypeVar
 
 from torchgrasp.arm.arm import Arm
-from torchgrasp.checks import Count, Range, Seed, Taken, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.contacts.region import combine
+from torchgrasp.foundation.checks import Count, Range, Seed, Taken, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import with_fingers
 from torchgrasp.ik.candidates import Reachable
-from torchgrasp.plan.region import combine
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.specs import ContactSpec, Mode, Ranking
 from torchgrasp.success.task import GraspTask, Resist
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
+from torchgrasp.values.specs import ContactSpec, Mode, Ranking
 
 Budget = Annotated[float, Range(1e-3, math.inf)]
 """A time budget [s]."""

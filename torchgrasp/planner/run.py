@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 
-from torchgrasp.base import count_status
-from torchgrasp.errors import Status
+from torchgrasp.foundation.base import count_status
+from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.batches import plan_hand, rank_together
 from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.planner.report import describe
 from torchgrasp.planner.request import Request
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 BEST = 20  # best grasps of a set of fingers by which the set is judged: the number that an evaluation tries of a view
 

@@ -8,19 +8,19 @@ from typing import Any
 
 from typing_extensions import Unpack
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Count, Fraction, Measured, Seed, checked
 from torchgrasp.data.accept import HandLike, SceneLike, as_hand, as_scene
-from torchgrasp.errors import BadArgument, FailedRows, GraspError, Status
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Count, Fraction, Measured, Seed, checked
+from torchgrasp.foundation.errors import BadArgument, FailedRows, GraspError, Status
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.request import SceneOptions, finger_sets, show_options
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.specs import ContactSpec
-from torchgrasp.threads import single_threaded
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ContactSpec
 
 
 @checked

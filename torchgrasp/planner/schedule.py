@@ -8,22 +8,22 @@ TRIED, TRIED_IN_SCENE = 250, 160
 OFFERED = 4  # planned rows for each row that the hand tries
 
 
-class Batch(NamedTuple):
+class BatchSize(NamedTuple):
     """The size of one batch: the number of new initial guesses, and of contact sets that the hand tries."""
 
     starts: int
     tried: int
 
 
-def schedule(starts: int, most: int) -> list[Batch]:
+def schedule(starts: int, most: int) -> list[BatchSize]:
     """Return batches with `starts` guesses and `most` contact sets in all; a small remainder joins the last batch."""
     growth = 6  # ratio of the sizes of successive batches
-    batches, size, most = list[Batch](), FIRST, min(most, starts)
+    batches, size, most = list[BatchSize](), FIRST, min(most, starts)
     tried = planned = 0
     while tried < most:
         size = size if most - tried >= 2 * size else most - tried
         tried += size
         further = min(starts, max(OFFERED * tried, starts * tried // most)) - planned
-        batches.append(Batch(further, size))
+        batches.append(BatchSize(further, size))
         planned, size = planned + further, growth * size
     return batches

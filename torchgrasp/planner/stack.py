@@ -8,21 +8,21 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import join, settle
+from torchgrasp.contacts.plan import plan_chunk, stages_for
+from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
+from torchgrasp.contacts.starts import start_chunks
+from torchgrasp.foundation.base import join, settle
 from torchgrasp.geometry.field_batch import FieldBatch
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import GraspProblem
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.joint import JointProblem
 from torchgrasp.ik.seeds import PostureLibrary
-from torchgrasp.plan.problem import ContactProblem, Shape, rows_of
-from torchgrasp.plan.solve import plan_chunk, stages_for
-from torchgrasp.plan.starts import chunk_sizes
 from torchgrasp.planner.problem import Problem, settle_hand
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import GRIP
-from torchgrasp.values import Certificate, ContactPlan, Contacts
+from torchgrasp.values.planning import Certificate, ContactPlan, Contacts
 
 Owner = Int[Tensor, "b"]
 """The index of the cloud to which each row belongs."""
@@ -37,7 +37,7 @@ class Stack:
 
     problems: tuple[Problem, ...]
     hand: Hand
-    shape: Shape
+    shape: ShapeLike
     constraints: ContactProblem
     body: EstimatedBody
     world: CollisionWorld
@@ -99,7 +99,7 @@ class Stack:
         if len(self) == 1:
             drawn = self.first.draw()
             for size in sizes:
-                parts = [self._plan(next(drawn), None) for _ in chunk_sizes(size)]
+                parts = [self._plan(next(drawn), None) for _ in start_chunks(size)]
                 yield join([plan for plan, _ in parts]), torch.cat([owner for _, owner in parts])
             return
         most = 2**17  # rows at once, whose temporaries an accelerator holds

@@ -12,10 +12,10 @@ from typing import Annotated
 
 from torch import Tensor
 
-from torchgrasp.base import check_whole, join
-from torchgrasp.checks import Count, Range, checked
-from torchgrasp.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.files import Field, Recent, begin_folder, hold_folder, load_tensors, read_json, save_tensors
+from torchgrasp.foundation.base import check_whole, join
+from torchgrasp.foundation.checks import Count, Range, checked
+from torchgrasp.foundation.errors import BadArgument, ModelFileError, OutputError
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.sample import (
     CHUNK_POSTURES,

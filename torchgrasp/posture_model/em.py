@@ -14,8 +14,8 @@ import torch.distributed
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.posture_model.gaussian import whitening_matrices
 
 CACHED_ROWS = 2048  # rows of one pass: their features and responsibilities stay in the cache
@@ -24,7 +24,7 @@ MAX_RESEEDS = 3  # a component that collapses more often shows that the data sup
 
 
 @dataclasses.dataclass(frozen=True)
-class Shard:
+class DataRows:
     """The data rows of one process; several processes form the default group of torch.distributed."""
 
     rows: Float[Tensor, "n d"]
@@ -32,14 +32,14 @@ class Shard:
     processes: int = 1
 
     @staticmethod
-    def of(rows: Float[Tensor, "n d"], distributed: bool) -> "Shard":
+    def of(rows: Float[Tensor, "n d"], distributed: bool) -> "DataRows":
         """Return the shard of this process; raises `BadArgument` if `distributed` is True without a process group."""
         if not distributed:
-            return Shard(rows)
+            return DataRows(rows)
         if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
             allowed = "True after torch.distributed.init_process_group, as under torchrun"
             raise BadArgument("distributed", "True in a process without a group", allowed)
-        return Shard(rows, torch.distributed.get_rank(), torch.distributed.get_world_size())
+        return DataRows(rows, torch.distributed.get_rank(), torch.distributed.get_world_size())
 
     def sum(self, x: Tensor) -> Tensor:
         """Return the sum of x over all processes; every process gets the same bits."""
@@ -73,7 +73,7 @@ class Components(Value):
 
 
 @dataclasses.dataclass(frozen=True)
-class Progress(Value):
+class FitProgress(Value):
     """The state of a fit. The state and the data determine the next step.
 
     `reseeded` counts how often each component collapsed and was placed anew; the likelihood may fall after that.
@@ -81,7 +81,7 @@ class Progress(Value):
     or the next step sees other rows. `rows` is the number of rows that the last step saw, or 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
-    >>> Progress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
+    >>> FitProgress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
     False
     """
 
@@ -93,19 +93,19 @@ class Progress(Value):
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit(Progress):
+class Fit(FitProgress):
     """The result of a fit; the last log-likelihood belongs to the final components."""
 
     converged: bool = False
 
 
 def expectation_maximisation(
-    shard: Shard,
-    start: Progress,
+    shard: DataRows,
+    start: FitProgress,
     iterations: int,
     tolerance: float,
     regularisation: float,
-    observer: Callable[[Progress], None] = lambda progress: None,
+    observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
     """Fit a mixture by EM steps until a step raises the mean log-likelihood by less than `tolerance` [nats].
 
@@ -120,11 +120,11 @@ def expectation_maximisation(
         if converged or len(history) > iterations:
             return Fit(state.components, state.reseeded, history, state.jumped, n, converged)
         components, reseeded = maximisation(sums, n, regularisation, state.reseeded)
-        state = Progress(components, reseeded, history, reseeded is not state.reseeded, n)
+        state = FitProgress(components, reseeded, history, reseeded is not state.reseeded, n)
         observer(state)
 
 
-def expectation(shard: Shard, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
+def expectation(shard: DataRows, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
     """Return for each component the features summed with its responsibilities, and the log-likelihood of all data."""
     x, coefficients = shard.rows, coefficients_from_components(components)
     sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
@@ -212,7 +212,7 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
     return Components(count[:, 0] / n, means, second - means[:, :, None] * means[:, None, :] + ridge)
 
 
-def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> Progress:
+def start_components(shard: DataRows, m: int, seed: int, regularisation: float) -> FitProgress:
     """Return the initial state of a fit: m components from k-means. Raises `BadArgument` for fewer distinct rows."""
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
@@ -222,10 +222,10 @@ def start_components(shard: Shard, m: int, seed: int, regularisation: float) -> 
     sums = _sums_of_clusters(shard, centres, features_from_data)
     n = round(float(sums[:, 0].sum()))
     components, reseeded = maximisation(sums, n, regularisation, torch.zeros(m, dtype=torch.long, device=sums.device))
-    return Progress(components, reseeded, sums.new_empty(0))
+    return FitProgress(components, reseeded, sums.new_empty(0))
 
 
-def _subsample(shard: Shard, generator: torch.Generator) -> Float[Tensor, "s d"]:
+def _subsample(shard: DataRows, generator: torch.Generator) -> Float[Tensor, "s d"]:
     """Return random data rows, drawn from all processes; every process gets the same rows."""
     x, lengths = shard.rows, shard.lengths()
     order = torch.randperm(int(lengths.sum()), generator=generator, device="cpu")  # for any number of processes
@@ -250,7 +250,7 @@ def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -
 
 
 def _sums_of_clusters(
-    shard: Shard, centres: Float[Tensor, "m d"], features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]]
+    shard: DataRows, centres: Float[Tensor, "m d"], features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]]
 ) -> Float[Tensor, "m f"]:
     """Return for each cluster the sum of the features of its rows; a row belongs to the nearest centre."""
     sums = centres.new_zeros(len(centres), len(features(centres[:1])))

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Kept, Value, kept
-from torchgrasp.checks import Range, Seed, check_dense, checked, is_known
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Kept, Value, kept
+from torchgrasp.foundation.checks import Range, Seed, check_dense, checked, is_known
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import cholesky
 
 ROWS_PER_CHUNK = 8192  # rows evaluated together: this bounds the memory for rows x components x dimensions

@@ -10,15 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import check_whole
-from torchgrasp.checks import ANY, Count, check_tensor, checked, is_known
-from torchgrasp.errors import BadArgument, ModelFileError, Status
 from torchgrasp.files import load_tensors, save_tensors
+from torchgrasp.foundation.base import check_whole
+from torchgrasp.foundation.checks import ANY, Count, check_tensor, checked, is_known
+from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.geometry.frames import degenerate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand
 from torchgrasp.posture_model.gaussian import GaussianMixture, map_rows, of_parameters
-from torchgrasp.values import ContactCode, Contacts
+from torchgrasp.values.planning import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
 """The six assignments of three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""

@@ -16,13 +16,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value
-from torchgrasp.checks import Range, Seed, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Batch, Value
+from torchgrasp.foundation.checks import Range, Seed, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import across, fibonacci_sphere, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
-from torchgrasp.specs import ContactSpec
+from torchgrasp.values.specs import ContactSpec
 
 ROLL = math.radians(25)  # deviation [rad] of either tilt of a contact direction from the pad's axis
 BALANCES = 200  # directions in the three-dimensional space of internal forces that are tried: 0.25 rad apart

@@ -7,14 +7,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Count, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Count, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model.em import start_components
-from torchgrasp.posture_model.fit import MAX_REGULARISATION, information_criterion, standardised_rows
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 from torchgrasp.posture_model.stepwise import growing_fits
+from torchgrasp.posture_model.training import MAX_REGULARISATION, information_criterion, standardised_rows
 
 COMPARED_MODES = 4  # modes of which the nearest is compared: a code has a few postures at most
 

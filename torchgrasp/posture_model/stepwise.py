@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchgrasp.posture_model.em import Fit, Progress, Shard, expectation, expectation_maximisation, maximisation
+from torchgrasp.posture_model.em import DataRows, Fit, FitProgress, expectation, expectation_maximisation, maximisation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,12 +22,12 @@ class Subsets:
     `sizes` are the numbers of rows. The last is the number of all rows, every other is half of the next.
     """
 
-    shard: Shard
+    shard: DataRows
     sizes: tuple[int, ...]
     place: Int[Tensor, "n"] | None = None  # of each row of this process in the random order of all rows
 
     @staticmethod
-    def of(shard: Shard, smallest: int | None, seed: int) -> "Subsets":
+    def of(shard: DataRows, smallest: int | None, seed: int) -> "Subsets":
         """Draw subsets of at least `smallest` rows; None, or more than half of the rows, leaves only all rows."""
         n = shard.count()
         sizes = tuple(size for size in halves(n)[::-1] if smallest is not None and size >= smallest) or (n,)
@@ -36,7 +36,7 @@ class Subsets:
         place = torch.randperm(n, generator=torch.Generator().manual_seed(seed), device="cpu")
         return Subsets(shard, sizes, place.split(shard.lengths().tolist())[shard.rank].to(shard.rows.device))
 
-    def take(self, size: int) -> Shard:
+    def take(self, size: int) -> DataRows:
         """Return the rows of this process in the subset of so many rows."""
         if self.place is None or size == self.sizes[-1]:
             return self.shard
@@ -51,11 +51,11 @@ def halves(n: int) -> list[int]:
 def fit_subsets(
     subsets: Subsets,
     sizes: Sequence[int],
-    start: Progress,
+    start: FitProgress,
     iterations: int,
     tolerance: float,
     regularisation: float,
-    observer: Callable[[Progress], None] = lambda progress: None,
+    observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
     """Fit a mixture by EM to the subsets of these sizes in turn; the other arguments are those of EM.
 
@@ -68,8 +68,8 @@ def fit_subsets(
 
 
 def likeliest_fit(
-    subsets: Subsets, starts: list[Progress], iterations: int, tolerance: float, regularisation: float
-) -> Progress:
+    subsets: Subsets, starts: list[FitProgress], iterations: int, tolerance: float, regularisation: float
+) -> FitProgress:
     """Fit each start to the smaller subsets; return the state of the likeliest fit."""
     enough = 8  # times the first subset: on fewer rows, the likeliest fit is often not the likeliest on all rows
     sizes = [size for size in subsets.sizes[:-1] if size <= enough * subsets.sizes[0]] or subsets.sizes
@@ -80,7 +80,7 @@ def likeliest_fit(
 
 
 def growing_fits(
-    shard: Shard, start: Progress, iterations: int, tolerance: float, regularisation: float
+    shard: DataRows, start: FitProgress, iterations: int, tolerance: float, regularisation: float
 ) -> Iterator[Fit]:
     """Yield fits without end, each of one component more; each starts from the last, its heaviest component split."""
     while True:
@@ -88,9 +88,9 @@ def growing_fits(
         sums, _ = expectation(shard, fit.components)
         sums = torch.cat([sums, torch.zeros_like(sums[:1])])  # a component without rows takes half of the heaviest
         components, split = maximisation(sums, shard.count(), regularisation, fit.reseeded.new_zeros(len(sums)))
-        start = Progress(components, torch.zeros_like(split), fit.log_likelihood[:0])
+        start = FitProgress(components, torch.zeros_like(split), fit.log_likelihood[:0])
 
 
-def _next(fit: Fit) -> Progress:
+def _next(fit: Fit) -> FitProgress:
     """Return the state in which the next subset begins: the likelihood of its rows is not yet known."""
-    return Progress(fit.components, fit.reseeded, fit.log_likelihood[:-1], jumped=True, rows=fit.rows)
+    return FitProgress(fit.components, fit.reseeded, fit.log_likelihood[:-1], jumped=True, rows=fit.rows)

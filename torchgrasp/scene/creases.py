@@ -5,8 +5,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.linalg import number_components
-from torchgrasp.lazy import ndimage, spatial
 from torchgrasp.scene.image import DepthImage
 
 REACH = 0.012  # distance [m] on either side of a crease over which its angle is measured

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchgrasp.checks import checked
-from torchgrasp.errors import BadArgument
 from torchgrasp.files import write_file
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import read_arrays
 from torchgrasp.scene.scene import Scene

@@ -12,17 +12,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Pose, checked
 from torchgrasp.cloud.depth import Array, frustum_of_image, read_depth
 from torchgrasp.cloud.pose import read_camera_pose
-from torchgrasp.cloud.tables import parse_npz
-from torchgrasp.errors import BadArgument, CloudFileError
+from torchgrasp.cloud.safe_files import parse_npz
 from torchgrasp.files import explain, read_bounded
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Pose, checked
+from torchgrasp.foundation.errors import BadArgument, CloudFileError
+from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import GRID
-from torchgrasp.limits import CLOUD_BYTES
 
 LEAST_PIXELS = 30  # fewest pixels of an object: fewer do not show its shape
 

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import Support
-from torchgrasp.lazy import ndimage
+from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
-from torchgrasp.scene.segment import count_labels, on_surface, segment
+from torchgrasp.scene.segment import count_labels, rests_on, segment
 
 MOST_LABELS = 1000  # more values are those of a photograph
 MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a box drawn around an object are
@@ -128,7 +128,7 @@ def _run_lengths(text: bytes) -> list[int]:
 
 
 def label_image(
-    image: DepthImage, support: Support, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
+    image: DepthImage, support: SupportPlane, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
     """Return each pixel's label and notes; labels come from given labels, a given mask, or else from segmentation.
 
@@ -137,7 +137,7 @@ def label_image(
     a twentieth of its pixels or more. A mask that loses nearly all is a `BadArgument`.
     """
     if labels is not None:
-        kept = torch.where(on_surface(image, support.plane), labels, 0)
+        kept = torch.where(rests_on(image, support.plane), labels, 0)
         if not bool((kept > 0).any()):
             raise BadArgument("labels", "none that rises above the table", "labels of objects on the table")
         names, own = labels.unique(return_inverse=True)
@@ -150,7 +150,7 @@ def label_image(
     objects = segment(image, support)
     if mask is None:
         return objects, ()
-    inside = mask & on_surface(image, support.plane)
+    inside = mask & rests_on(image, support.plane)
     pieces, length = torch.where(inside, objects, 0), int(objects.max()) + 1
     whole, part = count_labels(objects, length), count_labels(pieces, length)
     belongs = (part >= 0.5 * whole) | (part >= 0.3 * max(1, int(inside.sum())))
@@ -170,7 +170,12 @@ def label_image(
 
 
 def label_again(
-    image: DepthImage, former: Plane, support: Support, labels: Int[Tensor, "h w"], given: tuple[int, ...], first: int
+    image: DepthImage,
+    former: Plane,
+    support: SupportPlane,
+    labels: Int[Tensor, "h w"],
+    given: tuple[int, ...],
+    first: int,
 ) -> Int[Tensor, "h w"]:
     """Return the label of each pixel after another support has replaced the former table.
 
@@ -179,8 +184,8 @@ def label_again(
     assigned before the others.
     """
     own = torch.isin(labels, torch.tensor(given, dtype=torch.long))
-    kept = torch.where(own & on_surface(image, support.plane), labels, 0)
-    found, seen = segment(image, support), on_surface(image, former)
+    kept = torch.where(own & rests_on(image, support.plane), labels, 0)
+    found, seen = segment(image, support), rests_on(image, former)
     width, (names, row) = int(found.max()) + 1, labels.unique(return_inverse=True)
     shared = count_labels((row * width + found)[seen], len(names) * width).reshape(len(names), width)
     shared[:, 0] = 0
@@ -207,7 +212,7 @@ def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> I
     return torch.where(few[rest], 0, rest)
 
 
-def _on_support(image: DepthImage, support: Support) -> Bool[Tensor, "h w"]:
+def _on_support(image: DepthImage, support: SupportPlane) -> Bool[Tensor, "h w"]:
     """Return a mask of the measured pixels that lie on the plane of the support or below it."""
     return (image.depth > 0) & (support.plane.height(image.points()) < 0.01)
 

@@ -14,11 +14,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.parts import label_bodies
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import Hull
-from torchgrasp.lazy import spatial
+from torchgrasp.geometry.support_planes import Hull
 from torchgrasp.scene.image import DepthImage
 
 GAP, TOUCH, FAR = 0.008, 3, 0.05

@@ -15,12 +15,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, settle
-from torchgrasp.checks import checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, settle
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.lazy import ndimage
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.scene import Scene
 
@@ -154,14 +154,14 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
 
 
 @functools.cache
-def load_model() -> dict[str, Any]:
+def load_occupancy_model() -> dict[str, Any]:
     """Return the model's knots and weights for each kind of space: behind the target or an object, or unseen."""
     return json.loads(MODEL.read_text("utf-8"))
 
 
 def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
     """Return the probability that places of a kind are full; log-odds sum a piecewise linear function of each."""
-    model, odds = load_model()[kind], torch.full_like(features[:, 0], load_model()[kind]["bias"])
+    model, odds = load_occupancy_model()[kind], torch.full_like(features[:, 0], load_occupancy_model()[kind]["bias"])
     for x, knots, values in zip(features.unbind(-1), model["knots"], model["values"], strict=True):
         odds += torch.from_numpy(np.interp(x.numpy(), knots, values)).to(odds)
     return torch.sigmoid(odds).clamp_min(0.002)

@@ -9,19 +9,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Pose, Positive, checked
 from torchgrasp.cloud.pose import check_sizes, find_plausible
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Pose, Positive, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, to_upright
-from torchgrasp.geometry.support import find_table
+from torchgrasp.geometry.support_planes import find_table
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
 from torchgrasp.scene.merge import find_touching
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 
 @checked

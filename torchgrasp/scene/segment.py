@@ -6,10 +6,10 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchgrasp.cloud.sensor import fit_noise
+from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.linalg import number_components
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import Support
-from torchgrasp.lazy import ndimage, spatial
+from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage, label_radii
 from torchgrasp.scene.merge import REACH, merge_pieces
@@ -22,7 +22,7 @@ OVERHANG = 0.05  # distance [m] to which an object extends beyond the visible re
 VAST = 0.2  # greatest root mean square distance [m] of an object's points from their middle; a wall has more
 
 
-def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
+def segment(image: DepthImage, support: SupportPlane) -> Int[Tensor, "h w"]:
     """Return the label of each pixel: 1, 2, ... for objects, the largest first, and 0 for all other pixels.
 
     A piece is a connected component of the pixels above the table, without a jump of depth and without a crease. Pieces
@@ -56,7 +56,7 @@ def segment(image: DepthImage, support: Support) -> Int[Tensor, "h w"]:
     return _numbered(torch.where(torch.isin(whole, torch.tensor(noisy, dtype=whole.dtype)), 0, whole))
 
 
-def on_surface(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
+def rests_on(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
     """Return a mask of the pixels that rise above the table and lie on a surface; flying pixels are left out."""
     smooth = image.without_speckle()
     risen = _risen(smooth, table, *_smoothed(image, table))

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, at_once, rank_in_group, spread
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, at_once, rank_in_group, spread
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.shape.estimate import MeanJet, SurfaceJet
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.jets import Weighted, evaluate_jet, evaluate_mean, evaluate_mean_jet
 from torchgrasp.shape.kernel import Kernel, cross_covariance, differentiate_thin_plate, thin_plate
-from torchgrasp.shape.values import MeanJet, SurfaceJet
 
 Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 """A function of points and the surface of each."""

@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, map_tensors
+from torchgrasp.foundation.base import Value, map_tensors
 from torchgrasp.geometry.linalg import cholesky
+from torchgrasp.shape.estimate import Observations
 from torchgrasp.shape.kernel import Kernel, covariance_rows, cross_covariance, gram
 from torchgrasp.shape.posterior import Posterior
-from torchgrasp.shape.values import Observations
 
 Criterion = Literal["variance", "error", "both"]
 

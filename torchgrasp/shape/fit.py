@@ -9,15 +9,16 @@ from typing import Annotated, Literal
 
 import torch
 
-from torchgrasp.base import join
-from torchgrasp.checks import LEAST, Positive, Range, Seed, checked, is_known
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
 from torchgrasp.data.accept import CloudLike, as_cloud
-from torchgrasp.errors import BadArgument, CutOff, FewPoints, Flat, Gap, TwoBodies
+from torchgrasp.foundation.base import join
+from torchgrasp.foundation.checks import LEAST, Positive, Range, Seed, checked, is_known
+from torchgrasp.foundation.errors import BadArgument, CutOff, FewPoints, Flat, Gap, TwoBodies
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.plane import Plane, as_plane, round_upright, upright_frame
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.silhouette import Outlines, silhouettes
@@ -30,21 +31,20 @@ from torchgrasp.shape.conditioning import (
     posterior_given,
     select_points,
 )
-from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.hollow import HollowShape, tie_walls
-from torchgrasp.shape.kernel import Kernel, KernelName, is_plain, kernel_by_name
-from torchgrasp.shape.support import (
+from torchgrasp.shape.estimate import Normalisation, Observations, off_surface, on_surface
+from torchgrasp.shape.extra_observations import (
     FREE_NOISE,
     OUTER_POINTS,
-    Support,
+    ExtraObservations,
     camera_support,
     free_space_violations,
     paper_support,
     vessel_supports,
 )
-from torchgrasp.shape.values import Normalisation, Observations, off_surface, on_surface
-from torchgrasp.threads import single_threaded
-from torchgrasp.values import PointCloud
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.hollow import HollowShape, tie_walls
+from torchgrasp.shape.kernel import Kernel, KernelName, is_plain, kernel_by_name
+from torchgrasp.values.planning import PointCloud
 
 MAX_BUDGET = 1000  # greatest number of observed points: their factor has 4000 rows
 
@@ -150,7 +150,7 @@ def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitO
     return tie_walls(HollowShape.join(outer, inner, seen.cloud), middle)
 
 
-def _fit_surface(seen: PreparedCloud, support: Support, options: FitOptions) -> ShapeGP:
+def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOptions) -> ShapeGP:
     """Return the posterior of one surface, in the upright frame, given the cloud and the additional observations."""
     cloud, points, normals = seen.cloud, seen.points, seen.normals
     if support.rows is not None:

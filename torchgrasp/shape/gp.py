@@ -7,15 +7,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Pose, Positive, Range, Seed, check_moved, check_tensor, checked, is_known
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Pose, Positive, Range, Seed, check_moved, check_tensor, checked, is_known
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import cholesky, unit, unit_of_any
 from torchgrasp.geometry.plane import move
 from torchgrasp.shape.conditioning import append_observations
-from torchgrasp.shape.posterior import Posterior, symmetric_root
-from torchgrasp.shape.values import (
+from torchgrasp.shape.estimate import (
     JointEstimate,
     Normalisation,
     Observations,
@@ -23,7 +22,8 @@ from torchgrasp.shape.values import (
     on_surface,
     surface_deviation,
 )
-from torchgrasp.values import PointCloud, ShapeEstimate
+from torchgrasp.shape.posterior import Posterior, symmetric_root
+from torchgrasp.values.planning import PointCloud, ShapeEstimate
 
 MAX_JOINT = 1000  # most points of one joint posterior: its memory grows with the square of their number
 

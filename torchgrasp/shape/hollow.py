@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import map_tensors
-from torchgrasp.checks import Pose, checked
+from torchgrasp.foundation.base import map_tensors
+from torchgrasp.foundation.checks import Pose, checked
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.shape.completion.silhouette import TIE
+from torchgrasp.shape.estimate import JointEstimate, MeanJet, Observations, SurfaceJet, off_surface
+from torchgrasp.shape.extra_observations import Middle
 from torchgrasp.shape.gp import ShapeGP, common_fields
-from torchgrasp.shape.support import Middle
-from torchgrasp.shape.values import JointEstimate, MeanJet, Observations, SurfaceJet, off_surface
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 Found = TypeVar("Found")
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.checks import LEAST, Positive, Range, checked, is_known, is_tracked
+from torchgrasp.foundation.checks import LEAST, Positive, Range, checked, is_known, is_tracked
 
 Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise, smooth where r > 0 and four times so at 0 from the right, with k'(0) = 0."""

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchgrasp.base import Value, at_once, in_chunks
-from torchgrasp.checks import checked, is_known
-from torchgrasp.errors import IndefiniteCovariance
+from torchgrasp.foundation.base import Value, at_once, in_chunks
+from torchgrasp.foundation.checks import checked, is_known
+from torchgrasp.foundation.errors import IndefiniteCovariance
+from torchgrasp.shape.estimate import JointEstimate, MeanJet, SurfaceJet
 from torchgrasp.shape.jets import Weighted, distance_rows, evaluate_jet, evaluate_mean, evaluate_mean_jet
 from torchgrasp.shape.kernel import Kernel, cross_covariance, differentiate, gram, is_plain, separations
-from torchgrasp.shape.values import JointEstimate, MeanJet, SurfaceJet
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value, map_tensors
-from torchgrasp.checks import Range, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value, map_tensors
+from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import ndimage, spatial, trimesh
+from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.linalg import Points, limit_norm, number_components, unit
 from torchgrasp.geometry.mesh import clip_mesh
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, SignedDistanceField, field_from_surface
-from torchgrasp.lazy import ndimage, spatial, trimesh
+from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.values import surface_deviation
-from torchgrasp.threads import single_threaded
 
 RESOLUTION = 48  # cells along the domain's diameter
 COARSE, STEEPER = 4, 1.3

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchgrasp.checks import checked
-from torchgrasp.errors import MeshError, ModelFileError, OutputError
 from torchgrasp.files import load_tensors, save_tensors
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import MeshError, ModelFileError, OutputError
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.mesh import LEAST_VOLUME, check_solid, read_mesh
-from torchgrasp.lazy import trimesh
 from torchgrasp.sim.decompose import decompose
 
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}

@@ -24,7 +24,7 @@ SECONDS, SECONDS_PER_FACE = 60.0, 0.005  # processor time [s] that a mesh may ta
 
 def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return vertices and faces of each convex part of a mesh by CoACD with given settings, within time and memory."""
-    from torchgrasp.errors import MeshError, MissingExtra
+    from torchgrasp.foundation.errors import MeshError, MissingExtra
 
     if importlib.util.find_spec("coacd") is None:
         raise MissingExtra("coacd", "sim")

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.files import render
+from torchgrasp.foundation.errors import HandFileError, MissingExtra
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.urdf import Joint, Link, Urdf
-from torchgrasp.sim.scene import STILL, Scene
 from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, SceneSpec, pair_masks
+from torchgrasp.sim.simulated_scene import STILL, SimulatedScene
 
 OBJECT, NEIGHBOUR = "torchgrasp_object", "torchgrasp_neighbour_{}"
 """Names of the object (its body and its free joint), and of the neighbours, which are numbered."""
 
 
-class MujocoScene(Scene):
+class MujocoScene(SimulatedScene):
     """A simulated scene in MuJoCo: table, object and hand.
 
     A step runs the second half of MuJoCo's step (forces to state) before its first half (state to poses and contacts),

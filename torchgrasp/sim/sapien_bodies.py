@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.errors import MissingExtra
 from torchgrasp.files import temporary_folder, write_file
+from torchgrasp.foundation.errors import MissingExtra
 from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, mounted_urdf, pair_masks
 
 

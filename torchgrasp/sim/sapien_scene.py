@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from torchgrasp.sim.sapien_bodies import import_sapien, mounted_hand, open_world, place, rigid_body, table
-from torchgrasp.sim.scene import STILL, Scene, StepContacts
 from torchgrasp.sim.scene_spec import WRIST_JOINT, SceneSpec
+from torchgrasp.sim.simulated_scene import STILL, SimulatedScene, StepContacts
 
 
 def _noted(method: Callable[..., Any]) -> Any:
@@ -22,7 +22,7 @@ def _noted(method: Callable[..., Any]) -> Any:
     return call
 
 
-class SapienScene(Scene):
+class SapienScene(SimulatedScene):
     """A simulated scene in SAPIEN: table, object and hand."""
 
     def __init__(self, spec: SceneSpec) -> None:

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchgrasp.checks import checked
-from torchgrasp.errors import BadArgument, HandFileError
 from torchgrasp.files import render
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, HandFileError
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Urdf, read_urdf
-from torchgrasp.lazy import trimesh
 
 ARMATURE = 1e-3  # inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it
 LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"

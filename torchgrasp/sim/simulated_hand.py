@@ -6,16 +6,17 @@ from typing import Annotated
 import numpy as np
 import torch
 
-from torchgrasp.checks import Range, checked
-from torchgrasp.control import ClosingReference, FingertipSensor, Observation, Targets, TipContact
-from torchgrasp.errors import BadArgument
-from torchgrasp.sim.scene import Scene
+from torchgrasp.control import FingertipSensor, Observation, Targets, TipContact
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.sim.scene_spec import SceneSpec
-from torchgrasp.specs import Simulator
+from torchgrasp.sim.simulated_scene import SimulatedScene
+from torchgrasp.values.specs import Simulator
 
 
 @checked
-def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> Scene:
+def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedScene:
     """Return a fresh scene of a simulator, at its initial state.
 
     Raises `BadArgument` for an unknown simulator, or a joint of the hand without a position or drive. A bad URDF is a
@@ -51,7 +52,7 @@ class SimulatedHand:
     """
 
     def __init__(
-        self, scene: Scene, reference: ClosingReference, control_rate: float, generator: torch.Generator | None
+        self, scene: SimulatedScene, reference: ClosingReference, control_rate: float, generator: torch.Generator | None
     ) -> None:
         self.scene, self.reference = scene, reference
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))

@@ -1,6 +1,6 @@
 """Predicted success: what decides whether a grasp holds its task, a model that reads it, and the order of grasps."""
 
-from torchgrasp.success.explain import Cost, explain_success
-from torchgrasp.success.task import GraspTask, TaskWrenches
+from torchgrasp.success.reasons import Cost
+from torchgrasp.success.task import TaskWrenches
 
-__all__ = ["Cost", "GraspTask", "TaskWrenches", "explain_success"]
+__all__ = ["Cost", "TaskWrenches"]

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.contacts.problem import PerRow, rows_of
 from torchgrasp.geometry.signed_distance import DistanceField
-from torchgrasp.plan.problem import PerRow, rows_of
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import collision_field, extract_mesh

@@ -6,17 +6,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import spread
+from torchgrasp.contacts.balance import least_friction_forces
+from torchgrasp.foundation.base import spread
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.hand.hand import Hand
-from torchgrasp.plan.forces import least_friction_forces
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.loads import carrying_force, greatest_force
 from torchgrasp.success.moved import touch_moved
 from torchgrasp.success.task import GraspTask
-from torchgrasp.values import Contacts, Grasps
+from torchgrasp.values.planning import Contacts, Grasps
 
 CAUSES: dict[str, dict[str, str]] = {
     "load": {"force needed": "N", "force to spare": "1", "offset": "m"},

@@ -6,17 +6,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.contacts.balance import grasp_map, least_friction_forces
+from torchgrasp.contacts.form_closure import cone_edges, tangents
 from torchgrasp.geometry.frames import apply, inverse, rotate, skew, subsets
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
-from torchgrasp.plan.closure import cone_edges, tangents
-from torchgrasp.plan.forces import grasp_map, least_friction_forces
-from torchgrasp.values import Contacts, Grasps, IKSeeds
+from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
 CARRYING = 2.07  # log-odds of success that a lift loses for each factor e on the force that carries the load
 
 
-def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> Float[Tensor, "b"]:
+def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> Float[Tensor, "b"]:
     """Return the distance of `center` [m], where the load acts, from the longest side of the contacts' triangle.
 
     The distance is divided by the triangle's height over this side, about which the object turns most easily. For more
@@ -25,7 +25,7 @@ def load_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> F
     if points.shape[1] > 3:
         triples = subsets(points.shape[1], 3, points.device)
         each = center if center.ndim == 1 else center.repeat_interleave(len(triples), 0)
-        return load_arm(points[:, triples].flatten(0, 1), each).unflatten(0, (len(points), len(triples))).amin(1)
+        return lever_arm(points[:, triples].flatten(0, 1), each).unflatten(0, (len(points), len(triples))).amin(1)
     sides = points.roll(-1, dims=1) - points
     longest = torch.linalg.vector_norm(sides, dim=-1).argmax(1)[:, None, None].expand(-1, 1, 3)
     along, foot = unit(sides.gather(1, longest)[:, 0]), points.gather(1, longest)[:, 0]

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Value
 from torchgrasp.files import read_value
+from torchgrasp.foundation.base import Value
 
 MODEL, KIND = Path(__file__).with_name("model.safetensors"), "success-model"
 """The shipped model, and the kind of its file."""
@@ -60,6 +60,6 @@ class SuccessModel(Value):
 
 
 @functools.cache
-def load_model(device: torch.device | str = "cpu") -> SuccessModel:
+def load_success_model(device: torch.device | str = "cpu") -> SuccessModel:
     """Load the shipped model of success, in float64."""
     return read_value(MODEL, KIND, SuccessModel)[0].to(device)

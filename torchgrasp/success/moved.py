@@ -6,17 +6,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.contacts.balance import forces_near, internal_forces
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import fibonacci_sphere
 from torchgrasp.geometry.signed_distance import DistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.plan.forces import forces_near, internal_forces
-from torchgrasp.values import Contacts, Grasps
+from torchgrasp.values.planning import Contacts, Grasps
 
 Sets = Float[Tensor, "d g f 3"]
 
 
-class Touches(NamedTuple):
+class MovedContacts(NamedTuple):
     """Contact sets of g grasps after each of d displacements, one after another, with balanced `forces`.
 
     The strongest force pushes with 1 N. `touched` tells whether all fingers touch the object, and can press it.
@@ -27,7 +27,7 @@ class Touches(NamedTuple):
     touched: Bool[Tensor, "d g"]
 
 
-def touch_moved(hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Touches:
+def touch_moved(hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> MovedContacts:
     """Return where the fingers touch the object if the object is displaced, by distances that a hand still finds.
 
     The displacements fill a ball of 20 mm, in the axes of the hand. Each fingertip moves on along the line from its
@@ -49,7 +49,7 @@ def touch_moved(hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[
     pressed = forces_near(points, normals, weights.repeat(count, 1))
     push = -(pressed * normals).sum(-1).amax(-1)
     touched = found.all(-1) & torch.isfinite(push).view(found.shape[:2])
-    return Touches(Contacts(points, normals), pressed / push[:, None, None], touched)
+    return MovedContacts(Contacts(points, normals), pressed / push[:, None, None], touched)
 
 
 def trace(

@@ -7,27 +7,27 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import lexical_order
-from torchgrasp.errors import BadArgument, Status
+from torchgrasp.foundation.base import lexical_order
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.success.features import FEATURES
-from torchgrasp.success.model import load_model
+from torchgrasp.success.model import load_success_model
 from torchgrasp.success.promise import find_promise
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 DOMAIN = ("deviation", "size", "height", "friction", "mass", "force")
 """Features that must be in the range of the trials for a prediction to be known."""
 
 
-def is_known(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
+def is_covered(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
     """Return a mask of the grasps whose predicted success is supported by trials: `DOMAIN` is in their range."""
     rows = [FEATURES.index(name) for name in DOMAIN]
-    least, most = load_model(features.device).range[rows].T
+    least, most = load_success_model(features.device).range[rows].T
     return ((features[:, rows] >= least) & (features[:, rows] <= most)).all(1)
 
 
 def largest_known() -> float:
     """Return the largest half size [m] (from centre to surface) of objects for which success is predicted."""
-    return float(load_model().range[FEATURES.index("size"), 1])
+    return float(load_success_model().range[FEATURES.index("size"), 1])
 
 
 def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]) -> Grasps:
@@ -35,7 +35,9 @@ def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]
     good, score = torch.nonzero(grasps.status == Status.OK)[:, 0], grasps.score.clone()
     score[good] = log_odds.to(score)
     interval, supported = torch.zeros_like(score)[:, None].repeat(1, 2), torch.ones_like(score, dtype=torch.bool)
-    bounds = load_model(log_odds.device).interval(log_odds).where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
+    bounds = (
+        load_success_model(log_odds.device).interval(log_odds).where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
+    )
     interval[good], supported[good] = bounds.to(score), known
     return dataclasses.replace(grasps, score=score, interval=interval, known=supported)
 

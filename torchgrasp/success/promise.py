@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.success.model import load_model
+from torchgrasp.success.model import load_success_model
 
 
 class Promise(NamedTuple):
@@ -32,7 +32,7 @@ class Promise(NamedTuple):
 @functools.cache
 def find_promise(share: float) -> Promise | None:
     """Return the promise that a `share` of the returned grasps holds; None if the trials support no bound."""
-    log_odds, held, family = load_model().kept.unbind(1)
+    log_odds, held, family = load_success_model().kept.unbind(1)
     least = least_log_odds(log_odds, held > 0, family.long(), share)
     return None if least is None else Promise(least, len(log_odds), len(family.unique()))
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Force, Range, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Force, Range, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.plane import Plane
 

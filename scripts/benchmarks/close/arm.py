@@ -17,7 +17,6 @@ from benchmarks.ur5e import ur5e
 from torchgrasp import ContactSpec, Status, TrialSpec, load_hand, plan_grasps
 from torchgrasp.arm import Arm
 from torchgrasp.arm.reach import solve_tips
-from torchgrasp.closure import ClosureResult
 from torchgrasp.data import list_views, read_object_mesh, read_view
 from torchgrasp.evaluation.lift import run_lift
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
@@ -25,6 +24,7 @@ from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.sim.mujoco_scene import MujocoScene, format_numbers, nest_links, render_mjcf, scene_mjcf
 from torchgrasp.sim.scene_spec import SceneSpec
+from torchgrasp.values.closing import ClosureResult
 
 TRIAL = TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.1, approach=0.1, simulator="mujoco")
 """A lift as of protocol "table-lift", by as much as the planner checks the way of the arm."""

@@ -13,14 +13,14 @@ from benchmarks.common import Options
 from benchmarks.perturb import Perturbation, household_mass, perturb_view
 from torchgrasp import Grasps, ShapeGP, Status, fit_shape, load_grasps, load_hand, plan_grasps
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
-from torchgrasp.errors import GraspError
 from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.files import format_json, write_file
+from torchgrasp.foundation.errors import GraspError
+from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.geometry.signed_distance import SignedDistanceField
-from torchgrasp.jobs import run_tasks
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.specs import ContactSpec
+from torchgrasp.values.specs import ContactSpec
 
 RIGHT = Perturbation()
 """No error of the camera or the table."""

@@ -8,13 +8,13 @@ import torch
 import trimesh
 from scipy.interpolate import RBFInterpolator
 
-from torchgrasp.closure import NO_OPTIONS, ClosingOptions, SensorModel
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import combined_covariance, symmetric_root
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.values import Grasps
+from torchgrasp.values.closing import NO_OPTIONS, ClosingOptions, SensorModel
+from torchgrasp.values.planning import Grasps
 
 
 class Condition(NamedTuple):

@@ -25,14 +25,14 @@ from torch import Tensor
 from benchmarks.close.campaign import keep, plan_view, read_solid, run_all, table_spec
 from benchmarks.close.household import HOUSEHOLD
 from benchmarks.common import Options, Row, bench
-from torchgrasp.closure import ClosureResult
+from torchgrasp import close_hand
 from torchgrasp.control.tactile import joint_jacobian
-from torchgrasp.evaluation import close_hand
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import draw_push, seed_of
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
+from torchgrasp.values.closing import ClosureResult
 
 FRICTIONS = (0.4, 0.7, 1.0)
 """Frictions that the hand does not know."""

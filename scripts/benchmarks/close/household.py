@@ -17,10 +17,11 @@ from paper.trials import Subject, TableSpec, subjects
 from benchmarks.close.campaign import fit_view, keep, plan_view, read_solid, run_all, table_spec
 from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import PERTURBATIONS, Perturbation, find_perturbation, perturb_trial
-from torchgrasp.errors import Status
-from torchgrasp.evaluation import PROTOCOLS, PoseNoise, close_hand
+from torchgrasp import close_hand
+from torchgrasp.evaluation import PROTOCOLS, PoseNoise
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import draw_error, seed_of
+from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.load import load_hand
 
 HOUSEHOLD = PROTOCOLS["household"]

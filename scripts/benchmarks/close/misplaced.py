@@ -36,15 +36,15 @@ from benchmarks.close.conditions import (
 from benchmarks.common import Options, Row, bench
 from benchmarks.perturb import PERTURBATIONS, perturb_trial
 from torchgrasp import ClosureResult, Grasps, Status, TrialSpec, load_hand
-from torchgrasp.closure import SensorModel
-from torchgrasp.errors import GraspError
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, Truth, pull_grasp
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import error_from_object_pose, seed_of
 from torchgrasp.evaluation.views import choose_rows
+from torchgrasp.foundation.errors import GraspError
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.values.closing import SensorModel
 
 PLANNED_FRICTION = 0.6
 """Friction that grasps are planned for, and that the lifts have unless it is drawn: as in ada-grasp-ctrl (2025)."""

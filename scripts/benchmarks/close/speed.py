@@ -9,13 +9,12 @@ from collections.abc import Callable
 from unittest import mock
 
 from benchmarks.common import Options, Row, bench, least_seconds
-from torchgrasp import TrialSpec, close_hand, fit_shape, load_hand, load_object
-from torchgrasp.control import GraspController
+from torchgrasp import GraspController, TrialSpec, close_hand, fit_shape, load_hand, load_object
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import Status
 from torchgrasp.evaluation import GraspTrial, Truth
 from torchgrasp.evaluation.trial import TrialDriver
-from torchgrasp.jobs import run_tasks
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.shape.surface import surface_field
 
 STEPS = 100_000

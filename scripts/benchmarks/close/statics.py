@@ -18,7 +18,7 @@ from benchmarks.common import Options, Row, bench
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.hand.load import hand_of, load_hand
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 TABLE_LIFT = PROTOCOLS["table-lift"].trial
 PUSH = 2.5  # size of the push [N]

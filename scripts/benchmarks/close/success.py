@@ -14,21 +14,21 @@ from paper.trials import Subject, TableSpec, subjects
 
 from benchmarks.close.campaign import folder_of, keep, read_solid, run_all, table_spec
 from benchmarks.common import Options, Row, bench, mean_over
+from torchgrasp import plan_grasps
 from torchgrasp.data import read_view
-from torchgrasp.errors import Status
-from torchgrasp.evaluation import score
+from torchgrasp.evaluation import summary as score
 from torchgrasp.evaluation.intervals import Share, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import PROTOCOLS, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import sha256
+from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
-from torchgrasp.planner import plan_grasps
-from torchgrasp.specs import ContactSpec
 from torchgrasp.success.model import MODEL
 from torchgrasp.success.promise import find_promise
+from torchgrasp.values.specs import ContactSpec
 
 FRICTIONS, MASSES = (0.3, 0.6, 0.8), (0.05, 0.1, 0.25)
 """Coefficients of friction, and masses [kg] that take turns with them."""

@@ -12,7 +12,7 @@ from typing import Any
 from paper.tables6_7 import format_points
 
 from benchmarks.common import Options, Row, bench
-from torchgrasp.app.report.evaluation import list_causes
+from torchgrasp.app.report.evaluation_page import list_causes
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, PoseNoise, Protocol, ViewScore, evaluate, summarise
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import draw_slide, seed_of

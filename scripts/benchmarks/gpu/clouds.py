@@ -11,8 +11,8 @@ from torch import Tensor
 from benchmarks.common import Options, Row, bench
 from benchmarks.gpu.launches import views
 from torchgrasp import ContactSpec, Grasps, PointCloud, Status, load_hand, plan_grasps
-from torchgrasp.checks import checked
-from torchgrasp.jobs import pack, run_tasks, unpack
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.jobs import pack, run_tasks, unpack
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
 from torchgrasp.planner.problem import Problem
 from torchgrasp.planner.request import Request

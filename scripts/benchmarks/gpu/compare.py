@@ -11,7 +11,7 @@ from torch import Tensor
 
 from benchmarks.common import Options, Row, bench
 from benchmarks.gpu.kernels import Kernel, kernels
-from torchgrasp.base import Value, named_tensors
+from torchgrasp.foundation.base import Value, named_tensors
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,12 +30,12 @@ from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import refine
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
-from torchgrasp.posture_model.em import Shard, expectation, maximisation, start_components
+from torchgrasp.posture_model.em import DataRows, expectation, maximisation, start_components
+from torchgrasp.shape.estimate import Normalisation, on_surface
 from torchgrasp.shape.fit import condition
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.shape.values import Normalisation, on_surface
 from torchgrasp.testing import random_joints
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,10 +122,10 @@ def seeds_of(count: int) -> Prepared:
 def prepare_em(rows: int) -> Prepared:
     """One step of expectation-maximisation."""
     x = standardised(rows)
-    start = start_components(Shard(x), COMPONENTS, 0, 1e-6)
+    start = start_components(DataRows(x), COMPONENTS, 0, 1e-6)
 
     def step(x: torch.Tensor, start: Any) -> Any:
-        sums, log_likelihood = expectation(Shard(x), start.components)
+        sums, log_likelihood = expectation(DataRows(x), start.components)
         return maximisation(sums, len(x), 1e-6, start.reseeded)[0], log_likelihood
 
     return step, (x, start)

@@ -15,7 +15,7 @@ from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullResult, Truth, pull
 from torchgrasp.evaluation.protocols import POSE_NOISE, draw_hand_errors, seed_of
 from torchgrasp.evaluation.pull import DIRECTIONS, INTERVAL
 from torchgrasp.evaluation.trial import TrialDriver
-from torchgrasp.jobs import run_tasks
+from torchgrasp.foundation.jobs import run_tasks
 
 CASES = {
     f"{name}{', pose error' if error else ''}": (PROTOCOLS[name].with_trial(simulator="mujoco"), error)

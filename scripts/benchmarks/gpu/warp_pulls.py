@@ -7,12 +7,12 @@ import numpy as np
 import torch
 
 from benchmarks.gpu.warp_scene import WarpScenes
-from torchgrasp.checks import checked
 from torchgrasp.control.paper.closings import OpenLoopClosing
-from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, find_protocol
 from torchgrasp.evaluation.pull import DIRECTIONS, INTERVAL, PullResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import rotation_angle
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.foundation.errors import BadArgument, MissingExtra
 from torchgrasp.sim.mujoco_scene import OBJECT, MujocoScene, format_numbers, import_mujoco, scene_mjcf
 from torchgrasp.sim.scene_spec import SceneSpec
 

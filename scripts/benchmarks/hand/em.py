@@ -11,7 +11,7 @@ from sklearn.mixture import GaussianMixture
 
 from benchmarks.common import Options, Row, bench, least_seconds, timed
 from torchgrasp import fit_mixture, load_hand, load_mixture
-from torchgrasp.posture_model.em import Shard, expectation, maximisation, start_components
+from torchgrasp.posture_model.em import DataRows, expectation, maximisation, start_components
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.posture_model.score import growing_bic
 
@@ -35,17 +35,17 @@ def _step(o: Options) -> Row:
     """Time one step of both libraries from the same components on the same rows."""
     n = o.times(400_000)
     x = torch.randn(n, DIMENSIONS, generator=torch.Generator().manual_seed(o.seed), dtype=torch.float64)
-    start = start_components(Shard(x), COMPONENTS, o.seed, 1e-6)
+    start = start_components(DataRows(x), COMPONENTS, o.seed, 1e-6)
     first = start.components
     theirs: Any = GaussianMixture(COMPONENTS, reg_covar=1e-6)
     theirs.weights_, theirs.means_ = first.weights.numpy(), first.means.numpy()
     theirs.precisions_cholesky_ = torch.linalg.cholesky(torch.linalg.inv(first.covariances)).numpy()
 
     def ours() -> None:
-        maximisation(expectation(Shard(x), first)[0], n, 1e-6, start.reseeded)
+        maximisation(expectation(DataRows(x), first)[0], n, 1e-6, start.reseeded)
 
     rows = x.numpy()
-    density = abs(theirs._e_step(rows)[0] - float(expectation(Shard(x), first)[1] / n))
+    density = abs(theirs._e_step(rows)[0] - float(expectation(DataRows(x), first)[1] / n))
     mine = least_seconds(ours, 3)
     peer = least_seconds(lambda: theirs._m_step(rows, theirs._e_step(rows)[1]), 2, limit=60.0)
     what = f"EM step, {n:,} rows of {DIMENSIONS} numbers, {COMPONENTS} Gaussians, {o.threads} threads"

@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.common import Options, Row, bench, timed
 from torchgrasp import Contacts, load_hand, load_mixture
-from torchgrasp.errors import Status
+from torchgrasp.foundation.errors import Status
 from torchgrasp.ik.candidates import TIP_TOLERANCE
 from torchgrasp.ik.seeds import PostureLibrary
 from torchgrasp.ik.solve import IKSolution, solve_ik

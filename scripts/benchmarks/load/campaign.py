@@ -16,11 +16,11 @@ from torchgrasp import load_hand
 from torchgrasp.campaign import cluster
 from torchgrasp.data import list_views, manifest, read_object_mesh, write_objects
 from torchgrasp.data.shards import load_shard, read_row
-from torchgrasp.errors import ModelFileError
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec
-from torchgrasp.evaluation.views import View
+from torchgrasp.evaluation.views import ObjectView
 from torchgrasp.files import Field, format_json, write_file
-from torchgrasp.limits import JSON_BYTES
+from torchgrasp.foundation.errors import ModelFileError
+from torchgrasp.foundation.limits import JSON_BYTES
 from torchgrasp.sim.convex_parts import convex_parts
 
 MILLION, HOUR, DAY, YEAR = 1_000_000, 3600.0, 24 * 3600.0, 365.25 * 24 * 3600.0
@@ -94,7 +94,7 @@ def measure(o: Options) -> tuple[Rates, Row]:
     protocol = protocol.with_trial(simulator=o.simulator)
     meta = {"campaign": "0" * 64, "versions": json.dumps(cluster.versions())}
     views = [
-        View(Path(folder).resolve(), name, view, hand.source)
+        ObjectView(Path(folder).resolve(), name, view, hand.source)
         for folder in o.objects
         for name, view in list_views(folder, only=o.names, most=1)
     ]

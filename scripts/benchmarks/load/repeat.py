@@ -23,7 +23,7 @@ from torchgrasp import (
     plan_contacts,
     plan_grasps,
 )
-from torchgrasp.errors import Status
+from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.linalg import unit
 
 SPEC = ContactSpec(table=0.0)

@@ -21,11 +21,11 @@ from torchgrasp import load_hand
 from torchgrasp.campaign.cluster import OUTSTANDING, empty_shard, run_job, run_on_cluster, versions
 from torchgrasp.campaign.folder import Campaign, carry_out
 from torchgrasp.data.shards import JobRow, Shard, pack_shard
-from torchgrasp.errors import Status
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec
-from torchgrasp.evaluation.views import View
+from torchgrasp.evaluation.views import ObjectView
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.jobs import run_as_they_end
 from torchgrasp.hand.hand import Hand
-from torchgrasp.jobs import run_as_they_end
 
 WORKERS, JOBS, DYING = 1000, 10, 0.01
 """Workers, jobs for each of them, and the share of workers that die, evenly over the run."""
@@ -95,7 +95,7 @@ def waiting(o: Options) -> list[Row]:
     """Submit jobs to a scheduler without workers; count the memory of Python objects in client and scheduler."""
     count, spec, protocol = max(100, o.times(OUTSTANDING)), EvaluationSpec(), PROTOCOLS["tabletop"]
     meta = {"campaign": "0" * 64, "versions": json.dumps(versions())}
-    views = [View(Path("objects"), f"thing{j:06}", "view0", barrett().source) for j in range(count)]
+    views = [ObjectView(Path("objects"), f"thing{j:06}", "view0", barrett().source) for j in range(count)]
     with swarm(0) as cluster, Client(cluster, set_as_default=False) as client:
         gc.collect()
         tracemalloc.start()

@@ -10,11 +10,11 @@ from tqdm import tqdm
 
 from benchmarks.common import Options, Row, bench, least_seconds
 from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
+from torchgrasp.contacts.certify import certify, solve_by_highs
+from torchgrasp.contacts.form_closure import MIN_MARGIN, solve_closure_lp, wrenches
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.certify import certify, solve_by_highs
-from torchgrasp.plan.closure import MIN_MARGIN, solve_closure_lp, wrenches
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Contacts
+from torchgrasp.values.planning import Contacts
+from torchgrasp.values.specs import ContactSpec
 
 FRICTIONS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0)
 EDGES = (8, 8, 8, 8, 8, 3, 4, 5, 6, 12)

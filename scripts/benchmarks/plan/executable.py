@@ -15,7 +15,7 @@ from tqdm import tqdm
 from benchmarks.common import Options, Row, bench
 from benchmarks.ground_truth import read_views
 from torchgrasp import ContactSpec, PointCloud, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
-from torchgrasp.base import count_status
+from torchgrasp.foundation.base import count_status
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.attempts import solve_contact_first
 from torchgrasp.ik.candidates import GraspProblem

@@ -9,9 +9,9 @@ from tqdm import tqdm
 from benchmarks.common import Options, Row, bench
 from benchmarks.ground_truth import nearest_on_mesh, read_views
 from torchgrasp import ContactSpec, Status, fit_shape, plan_contacts
-from torchgrasp.plan.closure import closed_exact
+from torchgrasp.contacts.form_closure import closed_exact
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.values import Contacts
+from torchgrasp.values.planning import Contacts
 
 FRICTION = 0.6
 """With which certified contacts must be closed on the true surface."""

@@ -7,11 +7,11 @@ from tqdm import tqdm
 
 from benchmarks.common import Options, Row, bench, least_seconds
 from benchmarks.plan.certificates import random_contacts
+from torchgrasp.contacts.form_closure import cone_edges, tangents
+from torchgrasp.contacts.resist import resist_loads
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.plan.closure import cone_edges, tangents
-from torchgrasp.plan.resist import resist_loads
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Contacts
+from torchgrasp.values.planning import Contacts
+from torchgrasp.values.specs import ContactSpec
 
 FRICTIONS = (0.2, 0.4, 0.6, 0.8, 1.2)
 

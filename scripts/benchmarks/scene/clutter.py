@@ -15,20 +15,20 @@ from torch import Tensor
 
 from benchmarks.common import Options, Row, bench
 from benchmarks.scene.drop import PlacedScene, aim, drop, settle
+from torchgrasp import Scene, plan_scene
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
-from torchgrasp.errors import BadArgument, Status
 from torchgrasp.evaluation import GraspTrial, Share, Truth
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.evaluation.lift import lift_grasp
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of, load_hand
-from torchgrasp.jobs import run_tasks
-from torchgrasp.planner import ScenePlan, plan_scene
-from torchgrasp.scene import Scene
+from torchgrasp.planner import ScenePlan
 from torchgrasp.sim.scene_spec import Neighbour
-from torchgrasp.specs import ContactSpec, TrialSpec
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ContactSpec, TrialSpec
 
 TRIES = 2
 """Tries for each object."""

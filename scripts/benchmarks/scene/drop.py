@@ -16,14 +16,14 @@ from torch import Tensor
 from torchgrasp.cloud.camera import FOCAL, HEIGHT, WIDTH, look_at
 from torchgrasp.data import read_object_mesh
 from torchgrasp.data.shipped import list_objects, load_object
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.sim.convex_parts import convex_parts, hull
 from torchgrasp.sim.sapien_bodies import import_sapien, open_world, place, rigid_body, table
 from torchgrasp.sim.scene_spec import Body
-from torchgrasp.specs import TrialSpec
+from torchgrasp.values.specs import TrialSpec
 
 MASS = 0.1
 """Mass [kg] of every dropped object, as of `TrialSpec`."""

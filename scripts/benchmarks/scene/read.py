@@ -14,10 +14,10 @@ from tqdm import tqdm
 from benchmarks.common import Options, Row, bench
 from benchmarks.scene.rooms import KINDS, Room, rooms
 from benchmarks.scene.scenes import Picture, read_meshes, take_picture
+from torchgrasp import Scene
 from torchgrasp.cloud.camera import INTRINSICS
-from torchgrasp.errors import BadArgument, NoSupport
+from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.scene import Scene
 
 TABLES = ("apart", "apart", "crowded", "boxes", "close")
 """Kinds of scenes with a table, in turn."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from benchmarks.scene.scenes import scatter
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.sensor import SENSORS, SensorName
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.data import read_object_mesh
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 SIZES = {

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from benchmarks.common import Options, Row, bench
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support import Support
+from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.segment import segment
 
@@ -67,7 +67,7 @@ def pair(rng: np.random.Generator, azimuth: float) -> list[trimesh.Trimesh]:
 
 def agrees(image: DepthImage, labels: Int[Tensor, "h w"]) -> bool:
     """Return whether each thing of at least 300 seen pixels has a label of its own, and there is no other label."""
-    found, true = segment(image, Support(Plane.horizontal(0.0))), torch.where(image.depth > 0, labels, 0)
+    found, true = segment(image, SupportPlane(Plane.horizontal(0.0))), torch.where(image.depth > 0, labels, 0)
     mine: list[int] = []
     for k in range(1, int(true.max()) + 1):
         own = found[(true == k) & (found > 0)]

@@ -17,7 +17,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 if TYPE_CHECKING:
     import trimesh

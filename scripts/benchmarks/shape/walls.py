@@ -9,7 +9,7 @@ from torch import Tensor
 
 from benchmarks.ground_truth import sample_mesh
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 if TYPE_CHECKING:
     import trimesh

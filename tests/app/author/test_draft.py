@@ -8,7 +8,7 @@ from tests.make import box
 from torchgrasp import ContactSpec, Status, certify, fit_mixture, plan_grasps
 from torchgrasp.app.author.draft import draft_hand
 from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures, self_collision_from_urdf
 from torchgrasp.hand.hand_toml import read_hand_toml

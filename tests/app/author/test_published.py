@@ -10,7 +10,7 @@ import yourdfpy
 
 from torchgrasp.app.author.draft import Wish, new_hand
 from torchgrasp.app.author.fit_shapes import fit_shapes
-from torchgrasp.errors import BadArgument, HandFileError
+from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.urdf import read_published, read_urdf
 from torchgrasp.testing import check_hand, random_joints
 

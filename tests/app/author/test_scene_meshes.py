@@ -13,10 +13,10 @@ import trimesh
 from tests.app.author.test_published import change, made, mesh_claw
 from torchgrasp.app.author.draft import new_hand
 from torchgrasp.app.author.scene_meshes import check_glb, clean_dae
-from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.files import Malformed
+from torchgrasp.foundation.errors import HandFileError, MissingExtra
+from torchgrasp.foundation.limits import MESH_FACES
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.limits import MESH_FACES
 
 
 def scene(kind, size=(16.0, 20.0, 56.0)):

@@ -7,13 +7,13 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.app.report.run import Run
-from torchgrasp.closure import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
-from torchgrasp.errors import Status
+from torchgrasp.app.report.run_data import Run
+from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.load import load_hand
 from torchgrasp.shape.surface import Surface
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Certificate, ContactPlan, Contacts, Grasps, PointCloud
+from torchgrasp.values.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion
+from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, Grasps, PointCloud
+from torchgrasp.values.specs import ContactSpec
 
 F64 = torch.float64
 

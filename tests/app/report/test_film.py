@@ -11,9 +11,9 @@ from PIL import Image
 
 from torchgrasp.app.report.canvas import ALARM, SHADOW, Camera, Canvas, rgb
 from torchgrasp.app.report.film import STILL, TITLE, WIDTH, _list_plots, describe_film, draw_film
-from torchgrasp.app.report.run import explain_loss, find_loss, moments_of, moved_in_hand
-from torchgrasp.closure import ClosingTrace
-from torchgrasp.errors import Status
+from torchgrasp.app.report.run_data import explain_loss, find_loss, moments_of, moved_in_hand
+from torchgrasp.foundation.errors import Status
+from torchgrasp.values.closing import ClosingTrace
 
 F64, TICKS = torch.float64, 100
 NAMES = ("index", "middle", "thumb")

@@ -14,7 +14,7 @@ from torchgrasp.app.report import write_glb
 from torchgrasp.app.report.canvas import FINGERS, rgb
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.data.shipped import DATA, load_shipped_grasp
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """z, which is up in the run, becomes y; x stays."""

@@ -6,15 +6,15 @@ from html.parser import HTMLParser
 import pytest
 
 from tests.scores import SCORES
-from torchgrasp.app.report.evaluation import format_evaluation, write_evaluation
+from torchgrasp.app.report.evaluation_page import format_evaluation, write_evaluation
 from torchgrasp.app.report.page import TEMPLATES, format_page, grasp_rows, write_report
-from torchgrasp.app.report.run import closing_sentence, refusal, verdict
+from torchgrasp.app.report.run_data import closing_sentence, refusal, verdict
 from torchgrasp.app.report.viewer import write_viewer
-from torchgrasp.errors import OutputError, Status
 from torchgrasp.evaluation.intervals import share_over
 from torchgrasp.files import template_engine
+from torchgrasp.foundation.errors import OutputError, Status
 from torchgrasp.planner.explain import Explanation, Funnel, Losses, Trial
-from torchgrasp.specs import ContactSpec
+from torchgrasp.values.specs import ContactSpec
 
 PNG = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNkYAAAAAYAAjCB0C8AAAAASUVORK5CYII=")
 

@@ -14,7 +14,7 @@ from torchgrasp.app import cli
 from torchgrasp.app.report import write_recording
 from torchgrasp.app.report.solids import link_poses
 from torchgrasp.app.report.viewer import POSTURES
-from torchgrasp.errors import MissingExtra
+from torchgrasp.foundation.errors import MissingExtra
 
 ROOT = Path(__file__).parents[3]
 PYTHON = ROOT / ".beside" / "rerun" / "bin" / "python"

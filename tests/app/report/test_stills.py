@@ -8,11 +8,11 @@ import pytest
 import torch
 from PIL import Image
 
-from torchgrasp import load_scene
+from torchgrasp import Scene, load_scene
 from torchgrasp.app.report import draw_scene
 from torchgrasp.app.report.canvas import OBJECTS, SIZE, rgb
 from torchgrasp.app.report.page import draw_pictures
-from torchgrasp.app.report.scene import KINDS, encode_scene, sort_pixels
+from torchgrasp.app.report.scene_picture import KINDS, encode_scene, sort_pixels
 from torchgrasp.app.report.solids import PARKED, finger_of_links, solids_from_hand
 from torchgrasp.app.report.stills import (
     draw_among,
@@ -25,7 +25,6 @@ from torchgrasp.app.report.stills import (
 )
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
-from torchgrasp.scene import Scene
 
 
 def decode(png: bytes) -> np.ndarray:

@@ -22,10 +22,10 @@ from torchgrasp.app.report.viewer import (
     thin_mesh,
     three,
 )
-from torchgrasp.closure import ClosingTrace
-from torchgrasp.errors import Status
-from torchgrasp.hand.urdf import Shape
+from torchgrasp.foundation.errors import Status
+from torchgrasp.hand.urdf import LinkShape
 from torchgrasp.ik.motion import APPROACH_DISTANCE
+from torchgrasp.values.closing import ClosingTrace
 
 
 def unpack(buffer):
@@ -179,7 +179,7 @@ def test_the_report_links_to_the_page_only_where_there_is_one(run):
 )
 def test_rounded_shapes_fill_their_shape_but_for_the_edges(kind, size):
     place = {"xyz": (0.1, -0.2, 0.3), "rpy": (0.4, 0.5, 0.6)}
-    vertices, solid_faces, normals = round_shape(Shape(kind, size, **place))
+    vertices, solid_faces, normals = round_shape(LinkShape(kind, size, **place))
     sharp = {
         "box": lambda: trimesh.creation.box(size),
         "cylinder": lambda: trimesh.creation.cylinder(*size, sections=40),

@@ -9,13 +9,13 @@ import torch
 
 from tests.make import real
 from tests.point_fingers import NORMALS, TARGET, TOUCHING, observation, reference
-from torchgrasp import ClosingReference, load_hand
-from torchgrasp.control import GraspController, no_contact, observe
+from torchgrasp import ClosingReference, GraspController, load_hand
+from torchgrasp.control import no_contact, observe
 from torchgrasp.control.law import joint_step
 from torchgrasp.control.paper.closings import PaperClosing, PositionClosing
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 

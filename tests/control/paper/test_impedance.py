@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.point_fingers import PERIOD, TOUCHING, observation, real, reference
+from torchgrasp.contacts.balance import grasp_map
 from torchgrasp.control.holding import RAMP, held_forces
 from torchgrasp.control.paper.closings import (
     ROTATION_STIFFNESS,
@@ -16,7 +17,6 @@ from torchgrasp.control.paper.closings import (
 )
 from torchgrasp.control.paper.stability import PreferredForces, StabilityModel
 from torchgrasp.geometry.frames import rigid, rotation_from_vector, virtual_frame
-from torchgrasp.plan.forces import grasp_map
 
 
 def triangles(count: int, seed: int = 0) -> torch.Tensor:

@@ -9,7 +9,7 @@ from train.stability import fit_stability
 
 from torchgrasp import load_hand
 from torchgrasp.control.paper.stability import NAMES, StabilityModel, lengths_of, load_stability, state_of
-from torchgrasp.errors import BadArgument, ModelFileError
+from torchgrasp.foundation.errors import BadArgument, ModelFileError
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
 

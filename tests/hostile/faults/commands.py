@@ -13,18 +13,18 @@ import torch
 from tests.campaign.cheap import records
 from torchgrasp import load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.app.cli import evaluate as evaluate_command
-from torchgrasp.app.cli import grasps as grasp_command
+from torchgrasp.app.cli import grasp as grasp_command
 from torchgrasp.app.cli import hands as hand_commands
 from torchgrasp.app.report import page
 from torchgrasp.data.shards import JobRow, Shard, pack_shard
 from torchgrasp.data.shipped import DATA
-from torchgrasp.errors import Status
-from torchgrasp.evaluation import run as campaign
+from torchgrasp.evaluation import sweep as campaign
 from torchgrasp.evaluation.protocols import Protocol
-from torchgrasp.evaluation.score import ProtocolResult, ViewScore
-from torchgrasp.evaluation.views import EvaluationSpec, View
+from torchgrasp.evaluation.summary import ProtocolResult, ViewScore
+from torchgrasp.evaluation.views import EvaluationSpec, ObjectView
+from torchgrasp.foundation.errors import Status
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.specs import ContactSpec
+from torchgrasp.values.specs import ContactSpec
 
 POSE = [[1.0, 0.0, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]]
 
@@ -104,12 +104,12 @@ def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     objects = {"cup": {"views": views}, "jug": {"views": {"front": views["left"]}}, "loose": 5}
     (folder / "manifest.json").write_text(json.dumps({"objects": objects}))
 
-    def work(view: View, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str], *plan: object) -> bytes:
+    def work(view: ObjectView, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str], *plan: object) -> bytes:
         found = records(torch.Generator().manual_seed(len(view.view)), 4, 2, protocol.noise.draws)
         row = JobRow(view.object, view.view, executable=2, points=4, grasps=2, passed=int(found.passed.sum()))
         return pack_shard(Shard((row,), found), meta)
 
-    monkeypatch.setattr("torchgrasp.campaign.run.run_job", work)
+    monkeypatch.setattr("torchgrasp.campaign.campaign.run_job", work)
     monkeypatch.setattr(evaluate_command, "import_simulator", lambda name: None)
     words = ["campaign", str(folder), "--hand", "barrett", "--jobs-in-shard", "2", "--workers", "0"]
     return lambda out: [*words, "--out", str(out / "campaign"), "--parquet", str(out / "campaign" / "parquet")]

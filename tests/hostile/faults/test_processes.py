@@ -36,9 +36,9 @@ if __name__ == "__main__":
 
 STUB = """
 import dataclasses, os, signal, time
-from torchgrasp.errors import Status
-from torchgrasp.evaluation import run as campaign
-from torchgrasp.evaluation.score import ProtocolResult
+from torchgrasp.foundation.errors import Status
+from torchgrasp.evaluation import sweep as campaign
+from torchgrasp.evaluation.summary import ProtocolResult
 
 def plan(view, shelf, friction, spec):
     return dataclasses.replace(view.score, executable=2)

@@ -14,7 +14,7 @@ from torchgrasp import PointCloud, cloud_from_depth, load_hand, read_cloud, read
 from torchgrasp.app.author.draft import new_hand
 from torchgrasp.cloud.pose import read_pose
 from torchgrasp.cloud.read import save_cloud
-from torchgrasp.cloud.tables import read_image
+from torchgrasp.cloud.safe_files import read_image_file
 from torchgrasp.data import list_views, read_entries, read_entry
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
@@ -86,7 +86,7 @@ def images(folder: Path) -> list[Case]:
 
     def read(path: Path) -> None:
         given = {"depth": depth, "mask": None, "pose": pose}
-        given[path.stem] = read_pose("pose", path) if path.stem == "pose" else read_image(path.stem, path)
+        given[path.stem] = read_pose("pose", path) if path.stem == "pose" else read_image_file(path.stem, path)
         cloud_from_depth(given["depth"], camera, given["mask"], given["pose"])
 
     return [saved(path, read_scene if path.stem == "scene" else read) for path in sorted(folder.iterdir())]

@@ -8,7 +8,7 @@ import trimesh
 
 from tests.campaign.cheap import campaign, work_on
 from tests.hostile.fuzz.cases import Case, saved
-from torchgrasp import fit_mixture, load_grasps, load_hand, load_mixture
+from torchgrasp import GraspMixture, fit_mixture, load_grasps, load_hand, load_mixture
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.data import read_shards
@@ -16,10 +16,10 @@ from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, format_moveit
 from torchgrasp.hand import hand_of
 from torchgrasp.hand.load import hands_folder
-from torchgrasp.posture_model import GraspMixture, HandSamples, SampleSpec, load_samples, write_samples
+from torchgrasp.posture_model import HandSamples, SampleSpec, load_samples, write_samples
 from torchgrasp.posture_model.mixture import CODE_NAMES
 from torchgrasp.sim.convex_parts import _load, _save  # pyright: ignore[reportPrivateUsage]
-from torchgrasp.values import Certificate, Contacts, Grasps
+from torchgrasp.values.planning import Certificate, Contacts, Grasps
 
 
 def models(folder: Path) -> list[Case]:

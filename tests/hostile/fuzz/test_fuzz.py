@@ -11,7 +11,7 @@ from tests.hostile.fuzz import cases as strange
 from tests.hostile.fuzz import own
 from tests.hostile.fuzz.mutations import edits, limited, mutated
 from torchgrasp.app.author.draft import draft_hand
-from torchgrasp.errors import GraspError
+from torchgrasp.foundation.errors import GraspError
 
 KINDS = {make.__name__: make for make in (*strange.MAKERS, *own.MAKERS)}
 MOST_LETTERS = 2000

@@ -219,7 +219,7 @@ def test_the_underside_of_a_lying_rod_is_mirrored_from_its_top():
     assert off.abs().median() < 0.002
 
 
-@pytest.mark.filterwarnings("ignore::torchgrasp.errors.Flat")
+@pytest.mark.filterwarnings("ignore::torchgrasp.foundation.errors.Flat")
 @pytest.mark.parametrize("depth", [0.03, 0.05, 0.08])
 def test_a_box_that_shows_one_face_does_not_know_its_depth(depth: float):
     """Mirror planes of any depth hide their images, so their scores are equal: the back lies anywhere behind."""
@@ -234,7 +234,7 @@ def test_a_box_that_shows_one_face_does_not_know_its_depth(depth: float):
     assert found.std_m.median() > 0.01
 
 
-@pytest.mark.filterwarnings("ignore::torchgrasp.errors.Gap")
+@pytest.mark.filterwarnings("ignore::torchgrasp.foundation.errors.Gap")
 @pytest.mark.parametrize("azimuth", [15.0, 70.0])
 def test_a_frame_of_thin_bars_is_as_deep_as_the_bars_are_wide_and_its_rings_are_open(azimuth: float):
     upright, rings = trimesh.transformations.rotation_matrix(math.pi / 2, [0, 1, 0]), []

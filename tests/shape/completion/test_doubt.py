@@ -17,7 +17,7 @@ from tests.make import real
 from torchgrasp import cloud_from_depth, fit_shape
 from torchgrasp.cloud import look_at, partial_view
 from torchgrasp.cloud.diagnose import diagnose_cloud
-from torchgrasp.errors import CutOff, FewPoints, Flat, Gap, TwoBodies
+from torchgrasp.foundation.errors import CutOff, FewPoints, Flat, Gap, TwoBodies
 from torchgrasp.shape.completion.silhouette import silhouettes
 
 PATH = {"PYTHONPATH": str(Path(__file__).parents[3])}

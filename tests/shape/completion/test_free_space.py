@@ -7,8 +7,8 @@ import torch
 
 from torchgrasp import PointCloud, fit_shape
 from torchgrasp.shape.completion.silhouette import silhouettes
-from torchgrasp.shape.support import free_space, free_space_violations
-from torchgrasp.shape.values import Normalisation
+from torchgrasp.shape.estimate import Normalisation
+from torchgrasp.shape.extra_observations import free_space, free_space_violations
 
 CENTER = torch.tensor([0.0, 0.0, 0.06], dtype=torch.float64)
 
@@ -43,7 +43,7 @@ def _ring(radius: float) -> torch.Tensor:
     return torch.stack([radius * angle.cos(), radius * angle.sin(), torch.full_like(angle, 0.06)], -1)
 
 
-@pytest.mark.filterwarnings("ignore::torchgrasp.errors.Flat")
+@pytest.mark.filterwarnings("ignore::torchgrasp.foundation.errors.Flat")
 def test_a_slab_seen_face_on_stays_within_its_outline(generator: torch.Generator):
     """Nothing is seen of its sides; without free space the far side swells beyond the outline."""
     p = torch.rand(1000, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.0, 0.05, 0.17]).double()

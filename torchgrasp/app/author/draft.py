@@ -19,10 +19,10 @@ from torch import Tensor
 from torchgrasp.app.author.fit_shapes import ball_tip, replace_meshes, shape_points
 from torchgrasp.app.author.pads import guess_pads, is_primitive, order_by_facing, palm_of
 from torchgrasp.app.author.repair import fix_wrist, keep_below, merge_frames, repair_bodies, repair_joints
-from torchgrasp.base import FINGERTIPS
-from torchgrasp.checks import Seed, checked
-from torchgrasp.errors import BadArgument
 from torchgrasp.files import render
+from torchgrasp.foundation.base import FINGERTIPS
+from torchgrasp.foundation.checks import Seed, checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf

@@ -14,13 +14,13 @@ from jaxtyping import Float
 
 from torchgrasp.app.author.repair import place, pose_of
 from torchgrasp.app.author.scene_meshes import check_glb, clean_dae
-from torchgrasp.errors import HandFileError, MissingExtra
 from torchgrasp.files import explain, read_bounded
+from torchgrasp.foundation.errors import HandFileError, MissingExtra
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACES
 from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.hand.hand_toml import Pad
-from torchgrasp.hand.urdf import Shape, Urdf
-from torchgrasp.lazy import trimesh
-from torchgrasp.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACES
+from torchgrasp.hand.urdf import LinkShape, Urdf
 
 MESH_KINDS = (".stl", ".obj", ".ply", ".dae", ".glb")
 SAVING, SAVING_TIP = 0.12, 0.04
@@ -90,7 +90,7 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
     """Replace every mesh by a few boxes or a cylinder around its points; also return a sentence with the counts."""
     links, count, made = [], 0, 0
     for link in urdf.links:
-        shapes: list[Shape] = []
+        shapes: list[LinkShape] = []
         for shape, on_it in zip(link.shapes, points[link.name], strict=True):
             fitted = fit_shapes(on_it) if shape.kind == "mesh" else [shape]
             count, made = count + (shape.kind == "mesh"), made + (len(fitted) if shape.kind == "mesh" else 0)
@@ -104,7 +104,7 @@ def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Point
     """Replace the shapes of a tip by a ball at its end, towards `outward`, and on a long tip boxes up to the ball."""
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
-    shapes = [Shape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]
+    shapes = [LinkShape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]
     if np.ptp(reach) > 2.6 * ball.radius:
         motion = np.array(ball.normal) - ball.normal @ outward * outward
         motion /= np.linalg.norm(motion)
@@ -136,7 +136,7 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     return scale * _sample(mesh)
 
 
-def _primitive_points(shape: Shape) -> Points:
+def _primitive_points(shape: LinkShape) -> Points:
     if shape.kind == "box":
         return _sample(trimesh.creation.box(shape.size))
     if shape.kind == "sphere":
@@ -152,7 +152,7 @@ def _sample(mesh: "trimesh.Trimesh") -> Points:
     return np.concatenate([points, vertices[:: len(vertices) // count + 1]])
 
 
-def fit_shapes(points: Points) -> list[Shape]:
+def fit_shapes(points: Points) -> list[LinkShape]:
     """Return a few boxes, or a cylinder, that cover the points on a body."""
     round_share = 0.9  # a cylinder replaces boxes if its volume is less than this share of their volume
     turn = _axes(points)
@@ -179,7 +179,7 @@ def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
     return turned[:3, :3].T if np.prod(sizes) < turned_share * straight else np.eye(3)
 
 
-def _boxes(corners: list[Corners], axes: np.ndarray) -> list[Shape]:
+def _boxes(corners: list[Corners], axes: np.ndarray) -> list[LinkShape]:
     """Return collision boxes, given their lower and upper corners along the columns of `axes`."""
     return [_shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners]
 
@@ -217,11 +217,11 @@ def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[flo
     return found
 
 
-def _shape(kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray) -> Shape:
+def _shape(kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray) -> LinkShape:
     """Return a collision shape of a kind, size, rotation and centre; all numbers are rounded to 1e-6."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, center
     xyz, rpy = place(pose)
     x, y, z = (round(v, 6) for v in xyz)
     roll, pitch, yaw = (round(v, 6) for v in rpy)
-    return Shape(kind, tuple(max(round(float(v), 6), 1e-4) for v in size), (x, y, z), (roll, pitch, yaw))
+    return LinkShape(kind, tuple(max(round(float(v), 6), 1e-4) for v in size), (x, y, z), (roll, pitch, yaw))

@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_rpy
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import chain_from_urdf, map_directions, map_points, pose_in_carrier
-from torchgrasp.hand.urdf import Joint, Link, Shape, Triple, Urdf
+from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf
 
 TILT = math.radians(30)
 """Angle [rad] by which the contact of a round tip is turned from the direction of motion to the finger's end."""
@@ -145,7 +145,7 @@ def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
     return center + math.copysign(inset, rotation[:, long] @ center) * rotation[:, long]
 
 
-def _pad(shape: Shape, core: Vector, motion: Vector, outward: Vector) -> Pad:
+def _pad(shape: LinkShape, core: Vector, motion: Vector, outward: Vector) -> Pad:
     """Return the pad of a tip that is one simple shape, on the side of its motion; on a sphere nearer to its end."""
     if shape.kind == "sphere":
         normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]

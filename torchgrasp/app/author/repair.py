@@ -9,15 +9,15 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from torchgrasp.errors import BadArgument
-from torchgrasp.hand.urdf import Joint, Link, Mimic, Shape, Triple, Urdf
-from torchgrasp.lazy import trimesh
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.hand.urdf import Joint, Link, LinkShape, Mimic, Triple, Urdf
 
 EFFORT, VELOCITY = 1.0, 3.0  # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
 Step = tuple[Urdf, list[str]]
 
 
-def pose_of(part: Joint | Shape) -> np.ndarray:
+def pose_of(part: Joint | LinkShape) -> np.ndarray:
     """Return the 4 x 4 pose of a joint or a shape in the frame of its parent link."""
     return trimesh.transformations.compose_matrix(angles=part.rpy, translate=part.xyz)
 

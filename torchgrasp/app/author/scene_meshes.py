@@ -4,10 +4,10 @@ import importlib.util
 import json
 import xml.etree.ElementTree as ET
 
-from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.files import Malformed
+from torchgrasp.foundation.errors import BadArgument, MissingExtra
+from torchgrasp.foundation.limits import MESH_FACES
 from torchgrasp.hand.safe_xml import BoundedBuilder
-from torchgrasp.limits import MESH_FACES
 
 
 def clean_dae(data: bytes) -> tuple[bytes, float]:

@@ -18,21 +18,21 @@ import tyro
 from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
-from torchgrasp.app.cli import clouds, depth, doctor, evaluate, export, grasps, hands, look
+from torchgrasp.app.cli import clouds, depth_images, doctor, evaluate, export, grasp, hands, look
 from torchgrasp.app.cli.command import Command, execute
-from torchgrasp.errors import BadArgument, GraspError
+from torchgrasp.foundation.errors import BadArgument, GraspError
 
 __all__ = ["main", "run_and_exit"]
 
 CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
-    "Plan grasps": {"grasp": grasps.Grasp, "view": look.View, "objects": look.Objects},
+    "Plan grasps": {"grasp": grasp.Grasp, "view": look.OpenPage, "objects": look.Objects},
     "Exchange grasps with other programs": {"export": export.Export, "import": export.Import},
-    "Try many grasps in simulation": {"evaluate": evaluate.Evaluate, "campaign": evaluate.Campaign},
+    "Try many grasps in simulation": {"evaluate": evaluate.Evaluate, "campaign": evaluate.RunCampaign},
     "Point clouds and shapes": {
         "cloud check": clouds.CloudCheck,
         "cloud cut": clouds.CloudCut,
-        "cloud depth": depth.CloudDepth,
-        "cloud scene": depth.CloudScene,
+        "cloud depth": depth_images.CloudDepth,
+        "cloud scene": depth_images.CloudScene,
         "cloud thin": clouds.CloudThin,
         "cloud render": clouds.CloudRender,
         "cloud views": clouds.CloudViews,

@@ -8,18 +8,18 @@ import torch
 from torchgrasp import cloud as clouds
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import Command, arguments, naming, nested, option, positional, required
-from torchgrasp.checks import Range, Seed, check_tensor
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.data import write_objects
-from torchgrasp.errors import BadArgument
 from torchgrasp.export import check_surface_path, largest_std, save_surface
+from torchgrasp.foundation.checks import Range, Seed, check_tensor
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import as_plane
 from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 
 @arguments(points="file", normals="file")

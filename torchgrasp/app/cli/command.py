@@ -11,9 +11,9 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import tyro
 from tqdm import tqdm
 
-from torchgrasp.checks import Range, check_path
-from torchgrasp.errors import BadArgument
-from torchgrasp.marks import describe
+from torchgrasp.foundation.checks import Range, check_path
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import describe
 
 T = TypeVar("T")
 
@@ -116,7 +116,7 @@ def naming(**options: str) -> Iterator[None]:
         raise type(error)(options[argument], error.found, error.allowed) from error
 
 
-class Progress:
+class StageProgress:
     """Progress output: a line for each finished stage, and on a terminal a bar that names the current stage."""
 
     def __init__(self, *names: str) -> None:

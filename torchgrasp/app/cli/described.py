@@ -4,7 +4,7 @@ import importlib
 import importlib.util
 from pathlib import Path
 
-from torchgrasp.errors import BadArgument, MissingExtra
+from torchgrasp.foundation.errors import BadArgument, MissingExtra
 
 
 def locate_urdf(name: Path, meshes: Path | None, out: Path | None) -> tuple[Path, Path | None, Path | None]:

@@ -13,10 +13,10 @@ import torch
 from torchgrasp import __version__
 from torchgrasp.app.cli.command import Command, arguments, make_bar
 from torchgrasp.app.cli.inputs import import_simulator
-from torchgrasp.errors import BadArgument, MissingExtra
 from torchgrasp.files import format_columns
+from torchgrasp.foundation.errors import BadArgument, MissingExtra
 from torchgrasp.hand.load import hands_folder
-from torchgrasp.specs import Simulator
+from torchgrasp.values.specs import Simulator
 
 CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", "safetensors")
 """Packages that every command needs."""

@@ -8,20 +8,20 @@ from typing import Annotated, Any, Literal
 from torchgrasp import evaluation
 from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, STARTS_HELP, import_simulator, load_fingers
-from torchgrasp.app.report.evaluation import SHARE_NAMES, list_causes, list_figures, write_evaluation
+from torchgrasp.app.report.evaluation_page import SHARE_NAMES, list_causes, list_figures, write_evaluation
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
-from torchgrasp.checks import Count, Range, Seed
 from torchgrasp.data import JobRow, read_entries, write_parquet
-from torchgrasp.data.tables import SOURCE, import_arrow
-from torchgrasp.errors import BadArgument, DatasetError, Status
+from torchgrasp.data.table_folder import SOURCE, import_arrow
 from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.evaluation.protocols import find_protocol
-from torchgrasp.evaluation.run import evaluate
-from torchgrasp.evaluation.score import ViewScore, summarise
+from torchgrasp.evaluation.summary import ViewScore, summarise
+from torchgrasp.evaluation.sweep import evaluate
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
 from torchgrasp.files import check_begun, format_columns, format_json, format_line, hold_folder, write_file
-from torchgrasp.specs import ClosingMode, HoldingMode, Simulator
+from torchgrasp.foundation.checks import Count, Range, Seed
+from torchgrasp.foundation.errors import BadArgument, DatasetError, Status
+from torchgrasp.values.specs import ClosingMode, HoldingMode, Simulator
 
 OBJECTS_HELP = "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
 PROTOCOL_HELP = "the test that decides on success; see torchgrasp.evaluation.protocols"
@@ -159,7 +159,7 @@ def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
 
 
 @arguments()
-class Campaign(_Trials):
+class RunCampaign(_Trials):
     """Write a data set: for each view its cloud, grasps, proofs of closure, predicted and simulated success.
 
     Prints a line for each job, one object and view. Writes shards of safetensors with README.md and card.json, which

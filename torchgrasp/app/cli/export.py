@@ -13,19 +13,19 @@ from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
 from torchgrasp.app.report.glb import write_glb
-from torchgrasp.checks import Count
-from torchgrasp.cloud import read_cloud
 from torchgrasp.cloud.agreement import check_agreement
+from torchgrasp.cloud.read import read_cloud
 from torchgrasp.data.shards import load_grasps
-from torchgrasp.errors import BadArgument, ModelFileError, Status
 from torchgrasp.export.foreign import Quaternion, read_poses
 from torchgrasp.files import read_json, write_file
+from torchgrasp.foundation.checks import Count
+from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.problem import digest
-from torchgrasp.specs import ContactSpec, TrialSpec
-from torchgrasp.values import Grasps, PointCloud
+from torchgrasp.values.planning import Grasps, PointCloud
+from torchgrasp.values.specs import ContactSpec, TrialSpec
 
 Unit = Literal["m", "cm", "mm"]
 TEXTS: dict[str, Callable[..., str]] = {

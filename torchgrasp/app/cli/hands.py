@@ -13,21 +13,21 @@ from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, opt
 from torchgrasp.app.cli.described import locate_urdf
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, check_folder, holding, load_fingers
 from torchgrasp.app.report.stills import draw_hand, opposed_posture
-from torchgrasp.base import count_status
-from torchgrasp.checks import Range, Seed
 from torchgrasp.data.shipped import load_object
-from torchgrasp.errors import BadArgument, GraspError, OutputError, Status
 from torchgrasp.files import format_columns, hold_file, render, temporary_folder, write_file
+from torchgrasp.foundation.base import count_status
+from torchgrasp.foundation.checks import Range, Seed
+from torchgrasp.foundation.errors import BadArgument, GraspError, OutputError, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.request import finger_sets
 from torchgrasp.posture_model.dataset import write_samples
-from torchgrasp.posture_model.fit import Progress, fit_mixture
 from torchgrasp.posture_model.mixture import mixture_path
 from torchgrasp.posture_model.sample import SampleSpec, Sampling, can_close, sample_configurations
 from torchgrasp.posture_model.score import evaluate_mixture, growing_bic
+from torchgrasp.posture_model.training import FitProgress, fit_mixture
 from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
 TRIAL_STARTS = 100  # initial guesses with which a hand is tried on a shipped object
@@ -252,7 +252,7 @@ class HandTrain(Command):
             components = self.components or choose_components(hand, self.seed, self.workers)
             with make_bar(None, "step", desc="EM") as bar, naming(path="--checkpoint"):
 
-                def show(progress: Progress) -> None:
+                def show(progress: FitProgress) -> None:
                     bar.update()
                     bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
 

@@ -15,21 +15,21 @@ import torch
 from torch import Tensor
 
 from torchgrasp.app.cli.command import arguments, naming, option
-from torchgrasp.checks import check_tensor
 from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers
 from torchgrasp.cloud.pose import read_pose
+from torchgrasp.contacts.region import Region
 from torchgrasp.data.shipped import DATA, list_objects
-from torchgrasp.errors import BadArgument, MissingExtra, OutputError
 from torchgrasp.files import hold_folder
+from torchgrasp.foundation.checks import check_tensor
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
-from torchgrasp.plan.region import Region
-from torchgrasp.specs import Simulator
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
+from torchgrasp.values.specs import Simulator
 
 MOST_POINTS = 100_000  # most points of a file that are used; a shape is fitted to fewer
 CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)"

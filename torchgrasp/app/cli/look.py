@@ -6,11 +6,11 @@ from pathlib import Path
 from torchgrasp.app.cli.command import Command, arguments, option, positional
 from torchgrasp.app.report.viewer import VIEW
 from torchgrasp.data.shipped import DATA, MASSES, list_objects
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument
 
 
 @arguments()
-class View(Command):
+class OpenPage(Command):
     """Open the 3D page of a folder that `torchgrasp grasp` wrote, view.html, in the browser."""
 
     folder: Path = positional(

@@ -1,11 +1,11 @@
 """HTML pages, pictures and 3D files of runs and evaluations, drawn without a display or OpenGL."""
 
-from torchgrasp.app.report.evaluation import write_evaluation
+from torchgrasp.app.report.evaluation_page import write_evaluation
 from torchgrasp.app.report.glb import write_glb
 from torchgrasp.app.report.page import write_report
 from torchgrasp.app.report.recording import write_recording
-from torchgrasp.app.report.run import Run
-from torchgrasp.app.report.scene import draw_scene
+from torchgrasp.app.report.run_data import Run
+from torchgrasp.app.report.scene_picture import draw_scene
 from torchgrasp.app.report.viewer import show_grasps, write_viewer
 
 __all__ = [

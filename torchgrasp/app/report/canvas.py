@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from torchgrasp.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
+from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
 
 Points = Float[np.ndarray, "n 3"]
 Color = tuple[float, float, float]

@@ -7,14 +7,14 @@ import torch
 
 from torchgrasp.app.report import canvas as paint
 from torchgrasp.app.report.canvas import Direction
-from torchgrasp.app.report.run import explain_loss, first_touches, moments_of
+from torchgrasp.app.report.run_data import explain_loss, first_touches, moments_of
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import add_solids, to_array
-from torchgrasp.closure import ClosureResult
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.hand import Hand
-from torchgrasp.lazy import trimesh
+from torchgrasp.values.closing import ClosureResult
 
 WIDTH, STILL, TITLE = 1680, 340, 44
 """Width of the strip, height of its stills with titles, and height of a title [pixels]."""

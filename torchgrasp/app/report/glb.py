@@ -8,13 +8,13 @@ import numpy as np
 from torchgrasp.app.report.canvas import OBJECT, color_std, rgb
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import to_array
-from torchgrasp.checks import checked
 from torchgrasp.control.reference import check_single
 from torchgrasp.files import write_file
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.hand.hand import Hand
-from torchgrasp.lazy import spatial, trimesh
 from torchgrasp.shape.surface import Surface
-from torchgrasp.values import Grasps
+from torchgrasp.values.planning import Grasps
 
 
 @checked

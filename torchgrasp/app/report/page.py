@@ -9,11 +9,11 @@ from torchgrasp import files
 from torchgrasp.app.report import stills
 from torchgrasp.app.report.canvas import FINGERS
 from torchgrasp.app.report.film import describe_film, draw_film
-from torchgrasp.app.report.run import Run, verdict
-from torchgrasp.app.report.scene import encode_scene
-from torchgrasp.base import count_status
-from torchgrasp.checks import checked
-from torchgrasp.values import Grasps, format_success
+from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.app.report.scene_picture import encode_scene
+from torchgrasp.foundation.base import count_status
+from torchgrasp.foundation.checks import checked
+from torchgrasp.values.planning import Grasps, format_success
 
 TEMPLATES = Path(__file__).with_name("templates")  # of all pages
 Sections = dict[str, list[tuple[str, bytes]]]

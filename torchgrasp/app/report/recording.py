@@ -10,16 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.app.report.canvas import FINGERS, OBJECT, color_std, rgb
-from torchgrasp.app.report.run import Run, moments_of
+from torchgrasp.app.report.run_data import Run, moments_of
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import to_array
 from torchgrasp.app.report.viewer import POSTURES, pose_postures
-from torchgrasp.checks import checked
-from torchgrasp.errors import MissingExtra
 from torchgrasp.files import write_file
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import MissingExtra
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import upright_frame
-from torchgrasp.lazy import spatial
 
 ROOT = "world/obj"  # entity of the frame of the cloud, in which all poses of grasps are
 Index = tuple[str, str, np.ndarray]

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.app.report.canvas import FINGERS, HAND
+from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.urdf import Shape, read_urdf
-from torchgrasp.lazy import spatial, trimesh
+from torchgrasp.hand.urdf import LinkShape, read_urdf
 
 PARKED = -1  # finger index of a link that no grasping finger owns, such as the palm
 EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot finger
@@ -88,7 +88,7 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
 
 
 @functools.lru_cache(maxsize=512)  # a hand is drawn many times
-def round_shape(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def round_shape(shape: LinkShape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, faces and vertex normals of a collision shape with rounded edges, in its link's frame."""
     ball = np.asarray(trimesh.creation.icosphere(subdivisions=3 if shape.kind == "sphere" else 1, radius=1.0).vertices)
     radius = min(EDGE, min(shape.half) / 2)  # thin plates stay plates

@@ -10,12 +10,12 @@ from torch import Tensor
 from torchgrasp.app.report import canvas as paint
 from torchgrasp.app.report.canvas import Direction
 from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
+from torchgrasp.foundation.lazy import Image
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
-from torchgrasp.lazy import Image
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
-from torchgrasp.values import Contacts, Grasps, PointCloud
+from torchgrasp.values.planning import Contacts, Grasps, PointCloud
 
 
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:

@@ -20,14 +20,13 @@ from torch import Tensor
 from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, color_std, map_colors
 from torchgrasp.app.report.film import describe_film
 from torchgrasp.app.report.page import grasp_columns, grasp_rows, render
-from torchgrasp.app.report.run import Run, moments_of, verdict
+from torchgrasp.app.report.run_data import Run, moments_of, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
 from torchgrasp.app.report.stills import facing, to_array, view_of
-from torchgrasp.checks import checked
-from torchgrasp.closure import ClosureResult
-from torchgrasp.control.forces import squeeze
+from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.data.accept import CloudLike, HandLike, as_cloud
 from torchgrasp.files import write_file
+from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import upright_frame
 from torchgrasp.hand.hand import Hand
@@ -35,8 +34,9 @@ from torchgrasp.hand.load import hand_of
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
-from torchgrasp.specs import ContactSpec
-from torchgrasp.values import Grasps
+from torchgrasp.values.closing import ClosureResult
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ContactSpec
 
 VIEW = "view.html"  # name of the page beside the report
 MOST_GRASPS, MOST_FACES, MOST_TICKS = 20, 40_000, 120

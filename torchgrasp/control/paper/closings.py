@@ -6,15 +6,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.checks import checked
+from torchgrasp.contacts.balance import grasp_map, internal_forces
 from torchgrasp.control.holding import RAMP, held_forces, regulate
 from torchgrasp.control.law import MAX_SPEED, POSITION_RATE, blend, damped_inverse, joint_step, tip_velocity
 from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.tactile import NOISE, STILL, Observation, low_pass
+from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
 from torchgrasp.geometry.linalg import limit_norm
-from torchgrasp.plan.forces import grasp_map, internal_forces
 
 Rows = Float[Tensor, "*b 3 3"]
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done

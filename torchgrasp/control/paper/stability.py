@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import LEAST, Positive, Range, checked
-from torchgrasp.errors import BadArgument, ModelFileError
 from torchgrasp.files import load_tensors, save_tensors
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import LEAST, Positive, Range, checked
+from torchgrasp.foundation.errors import BadArgument, ModelFileError
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import check_compatible

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value, join
-from torchgrasp.checks import Count, Pose, checked
 from torchgrasp.cloud.neighbours import nearest
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Batch, Value, join
+from torchgrasp.foundation.checks import Count, Pose, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions, unit
-from torchgrasp.lazy import spatial
 from torchgrasp.shape.completion.axis import Revolution, find_axis, find_revolution
 from torchgrasp.shape.completion.ellipsoid import find_ellipsoid
 from torchgrasp.shape.completion.silhouette import FRONT_MARGIN, TIE, Outlines
@@ -29,7 +29,7 @@ from torchgrasp.shape.completion.symmetry import (
     planes_near,
 )
 from torchgrasp.shape.posterior import symmetric_root
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 NEW, SPACING = 0.006, 0.004  # least distance [m] of a hidden point from the cloud and from another hidden point
 LEAST_NOISE = 0.003  # standard deviation [m] of a mirrored point of an object that is symmetric about that very plane

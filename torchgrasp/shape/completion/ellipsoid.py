@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.foundation.lazy import optimize
 from torchgrasp.geometry.linalg import Points, farthest_points, fibonacci_sphere, unit
-from torchgrasp.lazy import optimize
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 
 INDEPENDENT, INDEPENDENT_RIM = 60, 8  # points of the cloud and the outline that count as independent

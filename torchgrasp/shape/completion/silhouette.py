@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Value
-from torchgrasp.checks import Pose, checked
-from torchgrasp.errors import BadArgument
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Pose, checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, farthest_points, unit
-from torchgrasp.lazy import ndimage, spatial
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 GROW, SHRINK = 2.0, 1.65  # the outline is a union of discs about the pixels, then shrunk [pixel spacings]
 FRONT_MARGIN = 0.002  # a point may be this far [m] in front of the visible surface: noise of the camera

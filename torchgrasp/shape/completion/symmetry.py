@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import farthest_points, fibonacci_sphere, reflect, reflect_directions, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.lazy import spatial
 from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 MATCH_DISTANCE = 0.003  # distance [m] over which a mirrored point stops matching the cloud
 PROBES = 150  # points of the cloud that score a plane

@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.base import Batch, Value
+from torchgrasp.foundation.base import Batch, Value
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, farthest_points, solve_least_squares, unit
-from torchgrasp.lazy import spatial
 from torchgrasp.shape.completion.axis import fit_axis, rotations_about_z
 from torchgrasp.shape.completion.complete import NEW, merge_hidden
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
-from torchgrasp.values import PointCloud
+from torchgrasp.values.planning import PointCloud
 
 LEVEL = 0.5  # least length of the horizontal part of a wall's normals: others are of rim, floor and noise
 BODY_SHARE, INNER_SHARE, OUTER_SHARE = 0.65, 0.09, 0.07  # least shares: of the walls on the body, of either wall

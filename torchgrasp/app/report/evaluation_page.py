@@ -1,0 +1,113 @@
+"""The HTML page of an evaluation: success rates with intervals, and failures."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchgrasp.app.report.page import TEMPLATES, render
+from torchgrasp.evaluation.causes import CAUSES
+from torchgrasp.evaluation.intervals import Share, format_share
+from torchgrasp.evaluation.summary import ViewScore, summarise
+from torchgrasp.files import write_file
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import Status
+
+NAMES = json.loads((TEMPLATES / "evaluation.json").read_text("utf-8"))
+SHARE_NAMES: dict[str, str] = NAMES["shares"]
+"""Descriptions of the success rates of a summary."""
+
+
+@checked
+def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> Path:
+    """Write the HTML page with a title, an evaluation's settings by name, and the results of `evaluate`, atomically.
+
+    Returns the path. Raises `OutputError` if the file cannot be written.
+
+    >>> import tempfile
+    >>> jug = ViewScore("jug", "view0", 0, 4.0, note="an open surface")
+    >>> page = write_evaluation(Path(tempfile.mkdtemp(), "page.html"), "Jugs", {"hand": "allegro"}, [jug])
+    >>> "allegro" in page.read_text()
+    True
+    """
+    return write_file(path, format_evaluation(title, asked, scores))
+
+
+def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> str:
+    """Return the HTML page of an evaluation; `asked` are its settings by name."""
+    summary = summarise(scores)
+    groups = {"": summary} | {f"{group}: ": some for group, some in summary["by_group"].items()}
+    most = max((n for reasons in summary["failures"].values() for n in reasons.values()), default=1)
+    success, views = summary["success"], sorted({score.view for score in scores})
+    return render(
+        "evaluation.html",
+        title=title,
+        summary=summary,
+        verdict=f"Passed: {format_share(summary['gsr'])}, with the 95 % interval over families.",
+        shares=[
+            (f"{group}{name}", *_share_cells(some[key], 1))
+            for group, some in groups.items()
+            for key, name in SHARE_NAMES.items()
+        ],
+        heads=[*("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked"), *views],
+        objects=_object_rows(scores, views, summary["by_object"]),
+        failures=[
+            (stage, name.lower(), str(n), n / most, Status[name].sentence)
+            for stage, reasons in summary["failures"].items()
+            for name, n in reasons.items()
+        ],
+        causes=[(name, text, CAUSES[name][1]) for name, text in list_causes(summary)],
+        notes=[(score.object, score.view, score.note) for score in scores if score.note],
+        figures=list_figures(summary),
+        success=success and (
+            f"Predicted {success['predicted']:.0%}, passed {success['passed']:.0%}; expected calibration error "
+            f"{success['error']:.2f}, Brier skill {success['skill']:.2f}, area under the curve {success['auc']:.2f}."
+        ),
+        bins=[
+            (f"{x.low:.0%} to {x.high:.0%}", f"{x.predicted:.0%}", *_share_cells(x.passed, 0))
+            for x in (success["bins"] if success else ())
+        ],
+        asked=[(name.replace("_", " "), str(value)) for name, value in asked.items()],
+    )  # fmt: skip
+
+
+def _share_cells(share: Share, digits: int) -> tuple[Any, ...]:
+    """Return table cells for a success rate: value, the share itself, which is drawn, interval and number of trials."""
+    value, low, high = ("-" if math.isnan(x) else f"{x:.{digits}%}" for x in share[:3])
+    return value, share, f"{low} to {high}" if share.units > 1 else "-", str(share.total)
+
+
+def _object_rows(
+    scores: Sequence[ViewScore], views: Sequence[str], by_object: Mapping[str, Any]
+) -> list[tuple[Any, ...]]:
+    """Return a table row for each object: its success rates, and the outcome of each view."""
+    outcome = {}
+    for score in scores:
+        passed = f"{sum(attempt.passed for attempt in score.attempts)} / {len(score.attempts)}"
+        outcome[score.object, score.view] = passed if score.attempts else score.refusal.name.lower()
+    rows = []
+    for name, row in by_object.items():
+        best = "-" if math.isnan(row["top1"].value) else f"{row['top1'].value:.0%}"
+        cells = [outcome.get((name, view), "") for view in views]
+        rows.append((name, *_share_cells(row["gsr"], 0), best, *cells))
+    return rows
+
+
+def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return table rows with each cause of objects not held: its name; its count, in all and by group, and its size."""
+    rows = []
+    for name, found in summary["causes"].items():
+        groups = ", ".join(f"{n} {group}" for group, n in found["by_group"].items() if group)
+        size = f"median {found['median']:.3g} {CAUSES[name][0]}"
+        rows.append((name, f"{found['count']}{groups and f' ({groups})'}, {size}"))
+    return rows
+
+
+def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return table rows with counts, mean forces, overlaps, slips and computing times."""
+    rows = []
+    for key, (text, style) in NAMES["figures"].items():
+        found = summary[key] if isinstance(summary[key], tuple | list) else [summary[key]]
+        rows.append((text, ", ".join("-" if x is None else format(x, style) for x in found)))
+    return rows

@@ -1,0 +1,242 @@
+"""The data of one run, from cloud to grasps and closing, and its results in words."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.app.report.canvas import ALARM, INK
+from torchgrasp.evaluation.causes import moved_in_hand, tick_of
+from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
+from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE
+from torchgrasp.foundation.base import count_status
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.plane import move, upright_frame
+from torchgrasp.hand.hand import Hand
+from torchgrasp.planner.explain import Explanation
+from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.surface import Surface
+from torchgrasp.values.closing import ClosureResult
+from torchgrasp.values.planning import ContactPlan, Grasps, PointCloud
+from torchgrasp.values.specs import ContactSpec
+
+LOST = "lost"  # name of the moment at which an object was lost
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """The inputs and results of one planning run, which a report shows.
+
+    Args:
+        object_name: name of the object in titles and sentences.
+        source: file of the cloud or the scene.
+        stages: name, result and wall time [s] of each stage.
+        mesh: the true object [m], in the frame of the cloud.
+        closure: result of closing on the true object; only with `mesh`.
+        scene: the scene that the cloud was cut from.
+        costs: what lowers the predicted success of the best grasp most.
+
+    >>> from torchgrasp import fit_shape, load_hand, load_object
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> from torchgrasp.shape import extract_surface
+    >>> view, hand, grasp = load_object("jug").view, load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    >>> surface = extract_surface(fit_shape(view), 24)
+    >>> verdict(Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, grasp).upright())
+    'The barrett hand has 1 executable grasp of the jug.'
+    """
+
+    object_name: str
+    source: Path
+    cloud: PointCloud
+    hand: Hand
+    spec: ContactSpec
+    surface: Surface
+    grasps: Grasps
+    stages: tuple[tuple[str, str, float], ...] = ()
+    plan: ContactPlan | None = None
+    mesh: "trimesh.Trimesh | None" = None
+    closure: ClosureResult | None = None
+    scene: Scene | None = None
+    explanation: Explanation | None = None
+    costs: tuple[str, ...] = ()
+
+    @property
+    def executable(self) -> Grasps:
+        """The grasps that passed every check, best first."""
+        return self.grasps[self.grasps.status == Status.OK]
+
+    def upright(self) -> "Run":
+        """Return the run in the upright frame of its cloud and table, where z is up."""
+        obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
+        upright_from_obj, mesh, closure = inverse(obj_from_upright), self.mesh, self.closure
+        if mesh is not None:
+            mesh = mesh.copy().apply_transform(upright_from_obj.numpy())
+        if closure is not None:
+            object_pose = upright_from_obj @ closure.object_pose.double() @ obj_from_upright
+            hand_pose = upright_from_obj @ closure.hand_pose.double()
+            closure = dataclasses.replace(closure, object_pose=object_pose, hand_pose=hand_pose)
+        return dataclasses.replace(
+            self,
+            cloud=move(self.cloud, upright_from_obj),
+            surface=move(self.surface, upright_from_obj),
+            grasps=move(self.grasps, upright_from_obj),
+            mesh=mesh,
+            closure=closure,
+            scene=None if self.scene is None else self.scene.to_upright(obj_from_upright),
+        )
+
+
+def verdict(run: Run) -> str:
+    """Return the result of a run in one sentence."""
+    hand, name = run.hand.name, run.object_name
+    if run.closure is not None:
+        return closing_sentence(run)
+    if count := len(run.executable):
+        return f"The {hand} hand has {count} executable grasp{'s' * (count > 1)} of the {name}."
+    return refusal(run) + ("" if run.explanation is None else f" {run.explanation.advice}")
+
+
+def closing_sentence(run: Run) -> str:
+    """Return a sentence that says whether the object was held, how far it rose, and how it moved in the hand."""
+    upright = run.upright()
+    closure, mesh = upright.closure, upright.mesh
+    assert closure is not None and mesh is not None
+    if not closure.held:
+        return f"The {run.hand.name} hand did not hold the {run.object_name}: {closure.status.sentence}."
+    centre = torch.tensor([*mesh.center_mass, 1.0], dtype=torch.float64)
+    rise = float((closure.object_pose[-1] - closure.object_pose[0])[2] @ centre)
+    moved, angle = closure.object_motion
+    return (
+        f"The {run.hand.name} hand held the {run.object_name}: lifted {rise:.2f} m, "
+        f"moved {1e3 * moved:.0f} mm and {math.degrees(angle):.0f} deg in the hand."
+    )
+
+
+def refusal(run: Run) -> str:
+    """Return a sentence that says why no grasp is executable: each reason with its count."""
+    head = f"The {run.hand.name} hand has no executable grasp of the {run.object_name}"
+    if len(run.grasps):
+        failed, total = run.grasps.status, f"{len(run.grasps)} postures"
+    elif run.plan is not None and not bool((run.plan.status == Status.OK).any()):
+        failed, total = run.plan.status, f"{len(run.plan)} starts"
+    else:
+        return f"{head}: {Status.OUT_OF_REACH.sentence}."
+    reasons = "; ".join(f"{n} of {total}: {status.sentence}" for status, n in count_status(failed).items())
+    return f"{head} ({reasons}){_too_low(run)}."
+
+
+def _too_low(run: Run) -> str:
+    """Return a remark if the object is too low for the hand's fingertips; "" otherwise."""
+    spec = run.spec.for_fingertips(float(run.hand.tips.radius.max()))
+    if spec.plane is None or not len(run.surface.vertices):
+        return ""
+    height, needed = float(spec.plane.height(run.surface.vertices).max()), spec.least_height
+    return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm" * (height < needed)
+
+
+class Moment(NamedTuple):
+    """A key moment of a closing: the index of its control tick, and its name."""
+
+    tick: int
+    name: str
+
+    @property
+    def color(self) -> str:
+        """The colour of the moment's title and line in the film strip."""
+        return ALARM if self.name == LOST else INK
+
+
+def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
+    """Return a mask of the fingertips that touch the object at each control tick."""
+    return closure.trace.normals.isfinite().all(-1)
+
+
+def first_touches(closure: ClosureResult) -> list[int]:
+    """Return the control tick at which each finger first touched the object, in the order of these touches."""
+    touched = touching(closure)
+    return [int(touched[:, finger].int().argmax()) for finger in closure.contact_order]
+
+
+def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
+    """Return the tick at which the object was pushed away, put down, let go or slipped too far; None if it was held."""
+    if closure.held:
+        return None
+    last, pressed = len(closure.time) - 1, tick_of(closure, 2)
+    if closure.status in (Status.START_OVERLAP, Status.UNSTABLE):
+        return last
+    if closure.status is Status.TOO_HEAVY:
+        return int(closure.hand_pose[:, 2, 3].argmax())
+    if closure.status is Status.EJECTED:
+        world = apply(closure.object_pose.double(), centre.double().expand(len(closure.time), 1, 3))[:, 0]
+        away = torch.linalg.vector_norm(world - world[0], dim=-1) > PUSHED_DISTANCE
+        return int(away.int().argmax()) if bool(away.any()) else last
+    distance, angle = moved_in_hand(closure, centre)
+    gone = (distance > SLIP_DISTANCE) | (angle > SLIP_ANGLE)
+    gone[: pressed + 1] = False
+    held = torch.nonzero(touching(closure).sum(1) >= 2)
+    let_go = min(int(held[-1]) + 1, last) if len(held) else pressed
+    return min(let_go, int(gone.int().argmax()) if bool(gone.any()) else last)
+
+
+def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> str:
+    """Return a sentence on when and in which phase the object was lost, and which finger failed first; "" if held."""
+    tick = find_loss(closure, centre)
+    if tick is None:
+        return ""
+    pressed, rises = tick_of(closure, 2), bool(closure.phases[2].isfinite())
+    time, start = float(closure.time[tick]), float(closure.time[pressed])
+    phase = "closed" if not rises or tick <= pressed else "rose" if time < start + LIFT_TIME else "held it"
+    never = " and ".join(name for finger, name in enumerate(fingers) if finger not in closure.contact_order)
+    reason = f"{never} never touched the object" if never else _first_to_go(closure, tick, fingers)
+    if closure.status in (Status.START_OVERLAP, Status.UNSTABLE, Status.TOO_HEAVY) or not reason:
+        reason = closure.status.sentence
+    lost = "Put down from" if closure.status is Status.TOO_HEAVY else "Lost at"
+    return f"{lost} {time:.2f} s, while the hand {phase}: {reason}."
+
+
+def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) -> str:
+    """Return a text that names the finger that first slid or let go for good before a tick; "" if none did."""
+    touched, sliding = touching(closure)[: tick + 1], closure.trace.sliding[: tick + 1].nan_to_num(0.0)
+    firm = touched & (sliding < 0.01)  # [m/s]: fingertips that stick creep more slowly
+    # The first tick after which each finger was never firm again; the finger with the earliest gave way first.
+    since = [int(torch.nonzero(column)[-1]) + 1 if bool(column.any()) else 0 for column in firm.T]
+    finger = min(range(len(since)), key=since.__getitem__)
+    begin = since[finger]
+    if begin > tick:
+        return ""
+    name, time = fingers[finger], float(closure.time[begin])
+    if not bool(touched[begin, finger]):
+        return f"{name} let go first, at {time:.2f} s"
+    force, normal = closure.trace.forces[begin, finger], closure.trace.normals[begin, finger]
+    press = float((force @ normal).abs())
+    across = float(torch.linalg.vector_norm(force - (force @ normal) * normal))
+    return f"{name} slid first, from {time:.2f} s on, under {across:.1f} N across at {press:.1f} N of normal force"
+
+
+def moments_of(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> list[Moment]:
+    """Return the key moments that the film strip of a closing shows, in order."""
+    found = [Moment(tick_of(closure, 0), "open hand")]
+    if closure.contact_order:
+        found.append(Moment(first_touches(closure)[0], f"{fingers[closure.contact_order[0]]} touches first"))
+    acts = torch.cat([torch.zeros(1, dtype=torch.bool), closure.trace.blend.isfinite().any(1)])
+    begins = torch.nonzero(acts[1:] & ~acts[:-1])[:, 0]  # of the closings
+    if closure.attempts == len(begins) > 1:
+        found.append(Moment(int(begins[-1]), f"closing {len(begins)} begins"))
+    all_touch = len(closure.contact_order) == len(fingers)
+    ends = ((1, "all touch" if all_touch else "the closing ends"), (2, "pressed"))
+    found += [Moment(tick_of(closure, k), name) for k, name in ends if bool(closure.phases[k].isfinite())]
+    lost = find_loss(closure, centre)
+    if lost is not None:
+        found.append(Moment(lost, LOST))
+    found.append(Moment(len(closure.time) - 1, "the end"))
+    found.sort(key=lambda moment: (moment.tick, moment.name == LOST))  # of two at one tick, the later is kept
+    later = [*(moment.tick for moment in found[1:]), len(closure.time)]
+    return [m for m, tick in zip(found, later, strict=True) if m.tick < tick]

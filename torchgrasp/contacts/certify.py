@@ -1,0 +1,213 @@
+"""Certificates of frictional form closure, Eq. (13) of the paper: for each contact set a verdict, with a proof.
+
+Positive coefficients phi that balance all contact wrenches prove closure, and bound its margin from below. A witness,
+which is a wrench that no contact opposes, disproves closure, and bounds the margin from above. A batched simplex method
+(module `closure`) finds both. The solver HiGHS decides where the two bounds leave the verdict open.
+
+The multipliers y of W phi = 0 are a multiple of the witness. By the envelope theorem a change dW of the wrenches
+changes the margin by -y . (dW phi).
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.contacts.form_closure import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, solve_closure_lp, wrenches
+from torchgrasp.foundation.base import FINGERTIPS
+from torchgrasp.foundation.checks import checked, is_known
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.frames import degenerate
+from torchgrasp.values.planning import Certificate, Contacts
+from torchgrasp.values.specs import ContactSpec
+
+EXACT = 1e-13  # largest |W phi| of a balance that needs no solver: an exact balance is near
+GAP = 1e-9  # largest difference of the two bounds of a proven margin, which must lie twice as far from `MIN_MARGIN`
+MAX_RESIDUAL = 1e-6  # largest |W phi| of a balance found by HiGHS, for wrenches of length about 1
+STRICT = 1e-10  # tolerance of HiGHS, its least. With its default, 1e-7, margins err by 1e-8 and may cross `MIN_MARGIN`.
+UNIT_TOLERANCE = 1e-3  # largest difference of a given normal's length from 1: what rounding in a text file leaves
+
+
+@checked(gradients=True)
+@single_threaded
+def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
+    """Prove in float64 whether contact sets have frictional form closure, Eq. (13) of the paper.
+
+    The margin is the largest s for which coefficients phi >= s with sum phi = 1 balance the wrenches W of all cone
+    edges, W phi = 0; it is -inf if no phi balances them. The friction cones have `spec.edges` edges at friction
+    `spec.planned_friction`. A set is `closed` if its margin is at least 1e-6 and its wrenches have full rank.
+
+    If a set is not closed, its `witness` v is a wrench that no contact force opposes: v.w >= 0 for every edge wrench w,
+    up to rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only the rank is too low, the wrenches are
+    smallest along v. Sets with contacts that are not finite are not closed, and their margin and witness are NaN.
+
+    The margin is differentiable once in points and normals. Where several phi or v are optimal, its derivative is that
+    of one of them; where the margin is -inf, its derivative is NaN. A second derivative, and one of another field,
+    raise `BadArgument`; in forward mode the latter is NaN. The `contacts` are sets of three to five with outward unit
+    normals, from any planner. Raises `BadArgument` for contacts of a wrong shape, normals that are not of length 1 (to
+    1e-3), or no `ContactSpec`.
+
+    >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
+    >>> certify(Contacts(corners, corners)).closed
+    tensor([True])
+    """
+    spec = ContactSpec() if spec is None else spec
+    points, normals = (x.double() for x in (check_contacts(contacts).points, contacts.normals))
+    wrench = wrenches(points, check_unit(normals), spec.planned_friction, spec.edges)
+    return Certificate(*_Proof.apply(wrench.flatten(1, 2), degenerate(points))[:5])
+
+
+class _Proof(torch.autograd.Function):
+    """The fields of a `Certificate` given m wrenches, then phi and multipliers; a `flat` set is on a line."""
+
+    @staticmethod
+    def forward(wrench: Float[Tensor, "b m 6"], flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
+        """Return the fields of the certificate, phi and multipliers; NaN for wrenches that are not finite."""
+        b, m, _ = wrench.shape
+        margin, ratio, residual = (wrench.new_full((b,), torch.nan) for _ in range(3))
+        witness, phi, dual = (wrench.new_full((b, width), torch.nan) for width in (6, m, 6))
+        rows = torch.nonzero(torch.isfinite(wrench).flatten(1).all(-1))[:, 0]
+        known = wrench[rows]
+        ratio[rows] = rank_ratio(known[:, None])
+        margin[rows], residual[rows], witness[rows], phi[rows], dual[rows] = _prove(known)
+        balanced = (margin >= MIN_MARGIN) & (residual <= MAX_RESIDUAL)
+        closed = balanced & (ratio >= MIN_RANK_RATIO) & ~flat
+        lacking = torch.nonzero(balanced & ~closed)[:, 0]
+        if len(lacking):
+            witness[lacking] = torch.linalg.svd(wrench[lacking], full_matrices=False).Vh[:, -1]
+        return margin, ratio, residual, closed, witness, phi, dual
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        """Keep what the derivatives need."""
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(output[3], *output[5:])
+        ctx.save_for_backward(inputs[0], *output[5:])
+        ctx.save_for_forward(inputs[0], *output[5:])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, None]:
+        """Return the derivative in the wrenches; raise `BadArgument` unless it is of the margin alone."""
+        margin, wrench, phi, dual = grads[0], *ctx.saved_tensors
+        if any(x is not None for x in grads[1:]):
+            raise BadArgument("contacts", "a derivative of another field of the certificate", "one of its margin")
+        if margin is None:
+            return None, None
+        return _Once.apply(-margin[:, None, None] * phi[..., None] * dual[:, None], wrench), None
+
+    @staticmethod
+    def jvp(ctx: Any, *grad_inputs: Any) -> tuple[Tensor | None, ...]:
+        """Return the change of the margin; of other fields it is NaN."""
+        wrench, phi, dual = ctx.saved_tensors
+        change = _Once.apply(-((phi[:, None] @ grad_inputs[0])[:, 0] * dual).sum(-1), wrench)
+        unknown = torch.full_like(change, torch.nan)
+        return change, unknown, unknown, None, unknown[:, None].repeat(1, 6), None, None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Tensor) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        """Prove the sets of all values of an axis together."""
+        pairs = zip(args, in_dims, strict=True)
+        rows = [x.expand(info.batch_size, *x.shape) if k is None else x.movedim(k, 0) for x, k in pairs]
+        proof = _Proof.apply(*(x.flatten(0, 1) for x in rows))
+        return tuple(x.unflatten(0, rows[0].shape[:2]) for x in proof), (0,) * len(proof)
+
+
+class _Once(torch.autograd.Function):
+    """A first derivative of the margin, in the `wrench`; to differentiate it again is an error."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(derivative: Tensor, wrench: Tensor) -> Tensor:
+        """Return the derivative."""
+        return derivative.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        """Keep nothing."""
+
+    @staticmethod
+    def backward(ctx: Any, *_: Any) -> Any:
+        """Raise `BadArgument`."""
+        raise BadArgument("contacts", "a second derivative of the margin", "a first derivative: the rest is not smooth")
+
+    jvp = backward
+
+
+def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
+    """Return for m wrenches the margin of force closure, the residual |W phi|, a witness, phi, and the multipliers."""
+    phi, witness = solve_closure_lp(wrench)
+    residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
+    margin, upper = phi.amin(-1), bound_margin(wrench, witness)
+    unbalanced = upper < -1 / GAP
+    margin, residual = torch.where(unbalanced, -torch.inf, margin), torch.where(unbalanced, torch.inf, residual)
+    proven = (residual <= EXACT) & (upper - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
+    for row in torch.nonzero(~(proven | unbalanced))[:, 0].tolist():
+        margin[row], residual[row], dual, balance = solve_by_highs(wrench[row].cpu().numpy())
+        phi[row] = balance.to(phi)
+        witness[row] = witness[row] if dual is None else torch.from_numpy(dual).to(witness)
+    product = (wrench @ witness[..., None])[..., 0]
+    dual = witness / (product - product.amin(-1, keepdim=True)).sum(-1, keepdim=True)
+    dual = torch.where(margin.isinf()[:, None], torch.nan, dual)
+    return margin, residual, witness, phi, dual
+
+
+def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
+    """Return the upper bound of the closure margin that each direction `witness` in wrench space proves, or NaN."""
+    # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g / sum(g - min g).
+    product = (wrench @ witness[..., None])[..., 0]
+    least = product.amin(-1)
+    return -least / (product - least[:, None]).sum(-1)
+
+
+def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None, Tensor]:
+    """Return closure margin, residual max |W phi|, witness (None if unknown) and phi of m wrenches, by HiGHS."""
+    from scipy.optimize import linprog
+
+    m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
+    equations = np.zeros((7, m + 1))
+    equations[:6, :m], equations[:6, m] = wrench.T, wrench.sum(0)
+    equations[6, :m], equations[6, m] = 1.0, m
+    solution = linprog(
+        c=np.r_[np.zeros(m), -1.0],
+        A_eq=equations,
+        b_eq=np.r_[np.zeros(6), 1.0],
+        bounds=[(0, None)] * m + [(None, None)],
+        method="highs",
+        options={"primal_feasibility_tolerance": STRICT, "dual_feasibility_tolerance": STRICT},
+    )
+    if solution.x is None:
+        return -np.inf, np.inf, None, torch.zeros(m, device="cpu")
+    phi, dual = solution.x[:m] + solution.x[m], solution.eqlin.marginals[:6]
+    length = np.linalg.norm(dual)
+    witness = -dual / length if length > 0 else None  # no multipliers: the balance of wrenches costs no margin
+    return float(solution.x[m]), float(np.abs(phi @ wrench).max()), witness, torch.from_numpy(phi)
+
+
+def check_unit(normals: Vectors) -> Vectors:
+    """Return the normals; raise `BadArgument` if the length of a normal is not 1. Normals with NaN are accepted."""
+    if not is_known(normals):
+        return normals
+    length = torch.linalg.vector_norm(normals.detach(), dim=-1)
+    wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
+    if len(wrong):
+        row, contact = wrong[0].tolist()
+        found = f"length {float(length[row, contact]):.4g} at row {row}, contact {contact}"
+        raise BadArgument("contacts.normals", found, "unit vectors (to 1e-3)")
+    return normals
+
+
+def check_contacts(contacts: Contacts) -> Contacts:
+    """Return the contacts; raise `BadArgument` if shapes are wrong, or if a set has not 3 to 5 contacts."""
+    points = contacts.points
+    for name, value in (("points", points), ("normals", contacts.normals)):
+        if value.shape != (*points.shape[:2], 3) or not value.is_floating_point():
+            found = f"shape {tuple(value.shape)} of {value.dtype}"
+            raise BadArgument(f"contacts.{name}", found, "floating numbers of shape b x f x 3, as many of each")
+    if not FINGERTIPS[0] <= points.shape[1] <= FINGERTIPS[1]:
+        allowed = f"{FINGERTIPS[0]} to {FINGERTIPS[1]}, one for each fingertip"
+        raise BadArgument("contacts.points", f"{points.shape[1]} contacts a row", allowed)
+    return contacts

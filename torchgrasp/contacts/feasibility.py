@@ -1,0 +1,176 @@
+"""Constraint checks of planned contacts: flatness of the surface around each contact, and all other constraints."""
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.contacts.form_closure import (
+    BALANCED,
+    MIN_MARGIN,
+    MIN_RANK_RATIO,
+    Vectors,
+    cone_edges,
+    rank_ratio,
+    solve_closure_lp,
+    tangents,
+    wrenches,
+)
+from torchgrasp.contacts.problem import (
+    ContactProblem,
+    PerRow,
+    ShapeLike,
+    rows_of,
+    triple_jet,
+    triple_mean_jet,
+    walls_at,
+)
+from torchgrasp.contacts.solver import project
+from torchgrasp.foundation.base import Batch, spread
+from torchgrasp.foundation.errors import Status
+from torchgrasp.geometry.frames import degenerate
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.shape.estimate import surface_deviation
+from torchgrasp.values.planning import ContactPlan, Contacts
+
+JUDGED_POINTS, GUIDING_POINTS = 8, 4  # points of the ring on which a plan is judged, and fewer that guide a solver
+INSIDE = 0.95  # share of the largest variation that guiding points allow: the judged points lie between them
+
+
+def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
+    """Return n unit tangents at each contact, at equal angles around its normal."""
+    return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
+
+
+def normal_variation(
+    shape: ShapeLike, points: Vectors, normals: Vectors, radius: PerRow, among: Bool[Tensor, "b f"] | None = None
+) -> Float[Tensor, "b f"]:
+    """Return for each contact the largest angle [rad] between its normal and the normals on a ring around it.
+
+    The ring has the given normalised `radius`. Contacts outside the mask `among` have infinite angles.
+    """
+    variation = torch.full_like(points[..., 0], math.inf)
+    among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
+    directions = ring_directions(normals, points, JUDGED_POINTS)
+    ring = points[:, :, None] + spread(radius, directions) * directions
+    for wall, own in walls_at(shape, points):
+        own = torch.nonzero(own & among).unbind(1)
+        surface = rows_of(wall, own[0])
+        around = project(surface, ring[own], steps=1)
+        there = unit(surface.mean_and_gradient(around.flatten(0, 1))[1]).view_as(around)
+        here = normals[own][:, None].expand_as(there)
+        sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
+        variation[own] = torch.atan2(sine, (here * there).sum(-1)).amax(-1)
+    return variation
+
+
+@dataclasses.dataclass(frozen=True)
+class FlatnessConstraint(Batch):
+    """A linear model, near the contact points `at`, of k constraint values that are <= 0 where the surface is flat.
+
+    `by_points` holds their derivatives by the 3 f coordinates of a contact set. To build this model costs as much as
+    several solver steps, so build it rarely.
+    """
+
+    value: Float[Tensor, "b k"]
+    by_points: Float[Tensor, "b k x"]
+    at: Vectors
+
+    def values(self, points: Vectors) -> Float[Tensor, "b k"]:
+        """Return the constraint values at points near `at`, from the linear model; one row per contact set."""
+        return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
+
+
+def flatness_constraint(shape: ShapeLike, points: Vectors, flatness: float, radius: PerRow) -> FlatnessConstraint:
+    """Model by how much the normals around each contact differ from its normal beyond the angle `flatness` [rad].
+
+    A value is |n - n_k|, for the normals n at a contact and n_k on a ring of normalised `radius` around it, less the
+    chord of the angle `flatness`. It is multiplied by the ring's radius, and so is a length.
+    """
+    (first, _), *others = walls_at(shape, points)
+    found = _wall_constraint(first, points, flatness, radius)
+    for wall, own in others:
+        other, own = _wall_constraint(wall, points, flatness, radius), own.repeat(1, GUIDING_POINTS)
+        slope = torch.where(own[..., None], other.by_points, found.by_points)
+        found = FlatnessConstraint(torch.where(own, other.value, found.value), slope, points)
+    return found
+
+
+def _wall_constraint(shape: ShapeLike, points: Vectors, flatness: float, radius: PerRow) -> FlatnessConstraint:
+    """Return the linear flatness constraint for contacts on one surface of the shape, such as a vessel's outer wall."""
+    jet = triple_mean_jet(shape, points)
+    identity = torch.eye(3, dtype=points.dtype, device=points.device)
+    around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
+    normal, normal_jacobian = jet.normals[:, None], jet.normal_jacobian[:, None]
+    ring = points[:, None] + spread(radius, around) * around  # (b, k, f, 3)
+    # The ring turns with the normal at its centre.
+    turned = around[..., None, :] @ normal_jacobian
+    ring_by_point = identity - spread(radius, turned) * normal[..., :, None] * turned
+    there = triple_mean_jet(shape, ring.flatten(0, 1))
+    difference = there.normals.view_as(ring) - normal
+    chord = torch.linalg.vector_norm(difference, dim=-1)
+    direction = difference / torch.where(chord == 0, 1.0, chord)[..., None]
+    change = there.normal_jacobian.view(*ring.shape, 3) @ ring_by_point - normal_jacobian
+    slope = (direction[..., None, :] @ change)[..., 0, :]
+    own = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+    by_points = torch.einsum("bkij,il->bkilj", spread(radius, slope) * slope, own).flatten(3).flatten(1, 2)
+    value = spread(radius, points[:, 0]) * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)
+    return FlatnessConstraint(value, by_points, points)
+
+
+ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far above rounding
+
+
+def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors) -> ContactPlan:
+    """Check contact sets at normalised `points`; return them as a plan, with each set's first violated constraint."""
+    spec, scale = problem.spec, shape.scale
+    jet = triple_jet(shape, points)
+    normals, metres = jet.normals, shape.metres(points)
+    wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
+    finite = torch.isfinite(wrench).flatten(1).all(1)
+    wrench = torch.where(finite[:, None, None, None], wrench, 0.0)
+    flat = wrench.flatten(1, 2)
+    coefficients, _ = solve_closure_lp(flat)
+    residual = (coefficients[:, None] @ flat)[:, 0].abs().amax(-1)
+    closed = finite & (residual <= BALANCED) & (coefficients.amin(-1) >= MIN_MARGIN)
+    closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not finite is False
+
+    apart = torch.linalg.vector_norm(problem.sides(points, normals), dim=-1).amin(-1) * scale
+    room = problem.room(points, normals)
+    good = {
+        Status.OUT_OF_DOMAIN: torch.linalg.vector_norm(points, dim=-1).amax(-1) <= shape.domain_radius,
+        Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
+        Status.OUTSIDE: within(problem, points).all(-1),
+        Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
+        Status.BELOW_TABLE: (room >= 0).all(-1),
+        Status.TOO_CLOSE: apart >= spec.least_separation,
+        Status.DEGENERATE: ~degenerate(points),
+    }
+    if spec.flatness is not None:
+        # A ring costs eight evaluations a contact, so it is measured only where nothing has failed before.
+        rows = torch.nonzero(torch.stack(list(good.values())).all(0))[:, 0]
+        ring = problem.rows(rows).ring
+        flat_rows = normal_variation(rows_of(shape, rows), points[rows], normals[rows], ring).amax(-1) <= spec.flatness
+        good[Status.NOT_FLAT] = torch.ones_like(closed).index_put((rows,), flat_rows)
+    good[Status.NOT_CLOSED] = closed
+    deviation = surface_deviation(jet.variance, jet.gradient)
+    std_m = spread(shape.std_factor * scale, deviation) * deviation
+    contacts, phi = Contacts(metres, normals, jet.variance, std_m), coefficients.unflatten(1, wrench.shape[1:3])
+    quality = torch.linalg.vector_norm(points.mean(1), dim=-1) * scale
+    return ContactPlan(contacts, phi, quality, first_violation(good))
+
+
+def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
+    """Return which normalised points lie in the region where contacts may be; at its border by more than rounding."""
+    if problem.beyond is None:
+        return torch.ones_like(points[..., 0], dtype=torch.bool)
+    return (problem.beyond(points.flatten(0, -2)) < -1e-9).view(points.shape[:-1])
+
+
+def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
+    """Return the first status, in the dictionary's order, whose condition is false; OK if all are true."""
+    met = torch.stack(list(good.values()))
+    codes = torch.tensor([*good, Status.OK], device=met.device)
+    return codes[torch.where(met.all(0), len(good), (~met).to(torch.uint8).argmax(0))]

@@ -1,0 +1,251 @@
+"""Summary of an evaluation: success rates, failures by stage, forces, times, calibration of predicted success."""
+
+import dataclasses
+import math
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.evaluation.intervals import Share, count_by, share_over
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import Count, Measured, checked
+from torchgrasp.foundation.errors import Status
+
+STAGES: dict[str, tuple[Status, ...]] = {
+    "start": (Status.START_OVERLAP,),
+    "closing": (Status.NO_CONTACT, Status.EJECTED),
+    "pulling or lifting": (
+        *(Status.MOVED, Status.DROPPED, Status.NOT_LIFTED),
+        *(Status.SLIPPED, Status.TOO_WEAK, Status.TOO_HEAVY),
+    ),
+    "simulation": (Status.UNSTABLE, Status.TIMED_OUT, Status.WORKER_DIED),
+}
+"""The stages at which an attempt can fail, in order, with their statuses."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class ProtocolResult(Value):
+    """The outcome of one trial of the grasp at `rank`, with the pose error of number `draw`; NaN if not measured.
+
+    Args:
+        moved: motion of the object [m]; in a lift relative to the hand.
+        turned: rotation of the object [rad]; in a lift relative to the hand.
+        force: mean normal force of the fingers [N].
+        overlap: overlap of hand and object at the grasp [m].
+        seconds: CPU time.
+        slip: motion of the object in the closed hand [m], in a lift.
+        slip_angle: rotation of the object in the closed hand [rad], in a lift.
+        predicted: predicted success of the grasp.
+        tries: number of grasps that were tried; all but `predicted`, `rank` and `overlap` is of the last grasp.
+        cause: why the object of a lift was not held, a name in `CAUSES`, or "".
+        size: size of the cause, in the cause's unit.
+    """
+
+    rank: int
+    draw: int
+    passed: bool
+    status: Status
+    moved: Measured = math.nan
+    turned: Measured = math.nan
+    force: Measured = math.nan
+    overlap: Measured = math.nan
+    seconds: Measured = math.nan
+    slip: Measured = math.nan
+    slip_angle: Measured = math.nan
+    predicted: Measured = math.nan
+    tries: Count = 1
+    cause: str = ""
+    size: Measured = math.nan
+
+    @property
+    def held(self) -> bool:
+        """Whether the status is `OK`: in a lift the object is then held without slip (`close_hand`)."""
+        return self.status is Status.OK
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class ViewScore(Value):
+    """The outcome of one view: planning, and the trials of its grasps.
+
+    Args:
+        executable: number of executable grasps.
+        seconds: CPU time of planning.
+        attempts: results of the grasps that were tried.
+        refusal: the most frequent failure if no grasp is executable.
+        note: details of the refusal.
+        family: family of the object (`torchgrasp.data`), or "".
+        group: group of the object, or "".
+        fingers: the grasping fingers.
+    """
+
+    object: str
+    view: str
+    executable: int
+    seconds: Measured
+    attempts: tuple[ProtocolResult, ...] = ()
+    refusal: Status = Status.OK
+    note: str = ""
+    family: str = ""
+    group: str = ""
+    fingers: str = ""
+
+    @property
+    def unit(self) -> str:
+        """The unit that confidence intervals resample: the object's family, or the object if it has no family."""
+        return self.family or self.object
+
+
+@checked
+def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
+    """Return the figures of an evaluation by name; their 95 % intervals resample families of objects.
+
+    * "gsr": grasp success rate, the fraction of trials that passed.
+    * "top1": fraction of best-ranked grasps that passed; a view without grasps counts as failed.
+    * "objects": fraction of objects with a success. "refused": number of views without a grasp.
+    * "by_object", "by_group": the same numbers for each object or group.
+    * "tries": numbers of trials that passed with the first grasp, with the second grasp, and so on.
+    * "failures": counts of statuses by stage. "causes": why objects were not held, with counts and median sizes.
+    * "fingers": counts of views by the grasping fingers.
+    * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
+    * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
+    * "success": calibration of the predictions (`judge`), or None.
+
+    >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
+    >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)
+    >>> found = summarise([ViewScore("jug", "view0", 40, 4.0, (held,)), lost])
+    >>> found["gsr"].value, found["top1"].value, found["refused"]
+    (1.0, 0.5, 1)
+    """
+    attempts = [attempt for score in scores for attempt in score.attempts]
+    spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
+    names = sorted({score.object for score in scores})
+    by_object = {name: _shares([score for score in scores if score.object == name]) for name in names}
+    groups = sorted({score.group for score in scores if score.group})
+    most = max((attempt.tries for attempt in attempts), default=1)
+    known = [(score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)]
+    predicted = torch.tensor([attempt.predicted for _, attempt in known], dtype=torch.float64)
+    passed = torch.tensor([attempt.passed for _, attempt in known], dtype=torch.bool)
+    reasons_of = {"planning": Counter(s.refusal.name for s in scores if s.refusal is not Status.OK)}
+    for stage, reasons in STAGES.items():
+        reasons_of[stage] = Counter(a.status.name for a in attempts if not a.passed and a.status in reasons)
+    return {
+        **_shares(scores),
+        "tries": [sum(a.passed and a.tries == k for a in attempts) for k in range(1, most + 1)],
+        "failures": {stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts},
+        "causes": _count_causes(scores),
+        "fingers": dict(Counter(score.fingers for score in scores if score.executable).most_common()),
+        "force_n": _mean(a.force for a in attempts),
+        "overlap_mm": _mean(1e3 * a.overlap for a in attempts),
+        "overlap_mm_max": max((1e3 * a.overlap for a in attempts if not math.isnan(a.overlap)), default=None),
+        "slip_mm": _quantiles(1e3 * a.slip for a in attempts if a.passed),
+        "slip_deg": _quantiles(math.degrees(a.slip_angle) for a in attempts if a.passed),
+        "plan_cpu_s": _mean(score.seconds for score in scores),
+        "trial_cpu_s": _mean(a.seconds for a in attempts),
+        "cpu_s": sum(x for x in spent if not math.isnan(x)),
+        "success": judge(predicted, passed, [unit for unit, _ in known]) if known else None,
+        "by_object": by_object,
+        "by_group": {name: _shares([score for score in scores if score.group == name]) for name in groups},
+    }
+
+
+def _count_causes(scores: Sequence[ViewScore]) -> dict[str, dict[str, Any]]:
+    """Return for each cause of objects not held its count, counts by group, and median size; the commonest first."""
+    lost = [(a.cause, score.group, a.size) for score in scores for a in score.attempts if a.cause]
+    found = {}
+    for cause, count in Counter(name for name, _, _ in lost).most_common():
+        groups = Counter(group for name, group, _ in lost if name == cause)
+        middle = statistics.median([size for name, _, size in lost if name == cause])
+        found[cause] = {"count": count, "by_group": dict(groups.most_common()), "median": middle}
+    return found
+
+
+def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
+    """Return success rates over some views, the number of views without any grasp, and that of executable grasps."""
+    draws = 1 + max((attempt.draw for score in scores for attempt in score.attempts), default=0)
+    tried = [(score.unit, attempt) for score in scores for attempt in score.attempts]
+    best = [(unit, attempt.passed) for unit, attempt in tried if attempt.rank == 0]
+    refused = [(score.unit, False) for score in scores if not score.attempts]
+    unit_of = {score.object: score.unit for score in scores}
+    lifted = {score.object for score in scores if any(attempt.passed for attempt in score.attempts)}
+    return {
+        "gsr": share_over(count_by((unit, attempt.passed) for unit, attempt in tried)),
+        "top1": share_over(count_by(best + refused * draws)),
+        "objects": share_over(count_by((unit, name in lifted) for name, unit in unit_of.items())),
+        "refused": len(refused),
+        "executable": sum(score.executable for score in scores),
+    }
+
+
+def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
+    """Return the median and the 95 % quantile of the values that are not NaN; None if there are none."""
+    known = torch.tensor([value for value in values if not math.isnan(value)], dtype=torch.float64)
+    if not len(known):
+        return None
+    median, most = known.quantile(torch.tensor([0.5, 0.95], dtype=torch.float64)).tolist()
+    return median, most
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    """Return the mean of the values that are not NaN; None if there are none."""
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else None
+
+
+class Bin(NamedTuple):
+    """A calibration bin: predictions in [low, high), their mean, and the success rate of their trials."""
+
+    low: float
+    high: float
+    predicted: float
+    passed: Share
+
+
+def judge(
+    predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]
+) -> dict[str, float | list[Bin]]:
+    """Return calibration measures of predicted probabilities, given the outcomes.
+
+    Trials with the same name in `units` count as dependent in the bins' confidence intervals.
+
+    "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect predictions and 0
+    for always predicting the mean. "auc" is the area under the ROC curve. "error" is the expected calibration error
+    over the "bins".
+    """
+    outcome = passed.to(predicted)
+    brier, rate, bins = float((predicted - outcome).square().mean()), outcome.mean(), _bins(predicted, passed, units)
+    off = sum(abs(x.predicted - x.passed.value) * x.passed.total for x in bins)
+    return {
+        "predicted": float(predicted.mean()),
+        "passed": float(rate),
+        "brier": brier,
+        "skill": 1 - brier / float(rate * (1 - rate)) if 0 < rate < 1 else math.nan,
+        "auc": _area_under_curve(predicted, passed),
+        "error": off / len(passed) if bins else math.nan,
+        "bins": bins,
+    }
+
+
+def _bins(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]) -> list[Bin]:
+    """Return calibration bins of width 0.1 of the predicted probability, without the empty ones."""
+    at, bins = (predicted * 10).long().clamp(0, 9), []
+    for k in at.unique().tolist():
+        rows: list[int] = torch.nonzero(at == k)[:, 0].tolist()
+        counts = count_by((units[row], bool(passed[row])) for row in rows)
+        bins.append(Bin(k / 10, (k + 1) / 10, float(predicted[rows].mean()), share_over(counts)))
+    return bins
+
+
+def _area_under_curve(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"]) -> float:
+    """Return the area under the ROC curve: how often a passed trial had a higher prediction than a failed one."""
+    good, bad = predicted[passed], predicted[~passed].sort().values
+    if not len(good) or not len(bad):
+        return math.nan
+    below, upto = torch.searchsorted(bad, good), torch.searchsorted(bad, good, right=True)
+    return float((below + upto).double().mean()) / 2 / len(bad)

@@ -1,0 +1,292 @@
+"""The base classes of all values: frozen dataclasses of tensors, and batches of them."""
+
+import dataclasses
+import functools
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchgrasp.foundation.checks import Range, check_moved, read_number, show
+from torchgrasp.foundation.errors import BadArgument, FailedRows, Status
+
+FINGERTIPS = (3, 5)  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
+Kept = TypeVar("Kept")
+SomeValue = TypeVar("SomeValue", bound="Value")
+SomeBatch = TypeVar("SomeBatch", bound="Batch")
+
+
+def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
+    """Apply a function to the tensors that several values have in the same field; return a value of the results.
+
+    Values in fields are mapped, too. Fields without tensors are copied from the first value.
+    """
+
+    def merge(name: str, *found: Any) -> Any:
+        if isinstance(found[0], Value):
+            return map_tensors(function, *found)
+        tensors = [isinstance(x, Tensor) for x in found]
+        if any(tensors) and not all(tensors):
+            raise BadArgument(name, "None beside a tensor", "a tensor in every value, or in none")
+        return function(*found) if all(tensors) else found[0]
+
+    kind = type(values[0])
+    names = [f.name for f in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
+    fields = {name: merge(name, *(getattr(value, name) for value in values)) for name in names}
+    if hasattr(kind, "__post_init__"):
+        return kind(**fields)
+    new = object.__new__(kind)  # checked fields need no second check, and loops make thousands of values
+    new.__dict__.update(fields)
+    return new
+
+
+class kept(functools.cached_property[Kept]):
+    """A cached property of tensors. Inside a transform of torch.func it keeps none: they would mean nothing later."""
+
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
+        """Return the value of the property."""
+        with torch.inference_mode(False):
+            value = super().__get__(instance, owner)
+        if instance is not None and torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore
+            vars(instance).pop(self.attrname, None)
+        return value
+
+
+class Value:
+    """Base class of all values: frozen dataclasses of tensors. `.to()` returns a copy on another device or dtype.
+
+    Values are equal if all their numbers are, on one device; NaN equals NaN. Copies and pickled values keep no caches.
+    """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for name in ("__repr__", "__eq__", "__hash__"):  # before `dataclass` writes its own
+            if name not in vars(cls):
+                setattr(cls, name, vars(Value)[name])
+
+    def __eq__(self, other: object) -> bool:
+        return _same(self._compared(), other._compared()) if type(self) is type(other) else NotImplemented  # pyright: ignore
+
+    def __hash__(self) -> int:
+        return _digest(self._compared())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # pyright: ignore[reportArgumentType]
+
+    def _compared(self) -> tuple[Any, ...]:
+        """Return the fields that equal values share."""
+        return tuple(getattr(self, f.name) for f in dataclasses.fields(self) if f.compare)  # pyright: ignore
+
+    def __repr__(self) -> str:
+        """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small tensors."""
+        fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
+        parts = [*self._about(), *(f"{f.name}={_short(getattr(self, f.name))}" for f in fields)]
+        lines = textwrap.wrap(f"{type(self).__name__}({', '.join(parts)})", 110, subsequent_indent="    ")
+        return "\n".join(lines if len(lines) <= 12 else [*lines[:11], "    ...)"])
+
+    def _about(self) -> list[str]:
+        """Return what the text of a value begins with, before the fields."""
+        return []
+
+    def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
+        """Return the value on another device or in another floating dtype; integer tensors keep their dtype.
+
+        Raises `BadArgument` if the device does not exist, or the dtype is neither float32 nor float64.
+        """
+        check_moved(*args, **kwargs)
+
+        def move(x: Tensor) -> Tensor:
+            moved = x.to(*args, **kwargs)
+            return moved if x.is_floating_point() else moved.to(x.dtype)
+
+        return map_tensors(move, self)
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two fields of values are equal."""
+    if isinstance(one, Tensor) and isinstance(other, Tensor):
+        alike = (one.shape, one.dtype, one.device) == (other.shape, other.dtype, other.device)
+        return alike and bool(((one == other) | ((one != one) & (other != other))).all())
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple | list) and type(one) is type(other):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return one is other or bool(one == other) or (_is_nan(one) and _is_nan(other))
+
+
+def _digest(value: Any) -> int:
+    """Return a number that equal fields share, from a few numbers of each tensor."""
+    if isinstance(value, Tensor):
+        flat, some = value.detach().reshape(-1), 8
+        return hash((value.shape, *flat[:: max(1, len(flat) // some)].nan_to_num().tolist()))
+    if isinstance(value, dict):
+        return hash(frozenset((key, _digest(x)) for key, x in value.items()))
+    return hash(tuple(map(_digest, value)) if isinstance(value, tuple | list) else not _is_nan(value) and value)
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and value != value
+
+
+def _short(value: Any) -> str:
+    """Return a short text for one field's value: type and shape of a tensor, length of a long list, or the value."""
+    if isinstance(value, Tensor):
+        if value.numel() <= 4 and value.device.type == "cpu":
+            return _digits(value.tolist())
+        return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+    if isinstance(value, dict | list | tuple) and len(value) > 4:
+        return f"{type(value).__name__} of {len(value)}"
+    text = " ".join(repr(value).split()) if isinstance(value, Value) else repr(value)  # wrapped once, as a whole
+    return text if len(text) <= 110 or isinstance(value, Value) else f"{text[:107]}..."
+
+
+def _digits(value: Any) -> str:
+    """Return a number, or nested lists of numbers, as text with five significant digits."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_digits, value))}]"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+class Batch(Value):
+    """A value whose tensors share their first axis, the rows. An index selects rows; `len` is their number."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, dataclasses.fields(self)[0].name))  # pyright: ignore[reportArgumentType]
+
+    def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:
+        """Return a batch of the rows that a slice, a mask or indices select. A single index gives a batch of one row.
+
+        Raises `BadArgument` for an index of another kind, such as a single boolean, and `IndexError` beyond the last
+        row.
+        """
+        chosen = read_rows(rows, len(self))  # once for all tensors: on a GPU the host waits for the number of rows
+        return map_tensors(lambda x: x[chosen], self)
+
+    def __iter__(self: SomeBatch) -> Iterator[SomeBatch]:
+        """Iterate over the rows, each a batch of one."""
+        return (self[i] for i in range(len(self)))
+
+    def raise_for_status(self: SomeBatch) -> SomeBatch:
+        """Return this batch if the status of every row is `Status.OK`; else raise `FailedRows` with the counts."""
+        counts = count_status(getattr(self, "status"))  # noqa: B009
+        failed = {s: k for s, k in counts.items() if s is not Status.OK}
+        if failed:
+            raise FailedRows("; ".join(f"{k} of {len(self)} rows: {s.sentence}" for s, k in failed.items()))
+        return self
+
+
+def read_rows(rows: Any, count: int) -> slice | Tensor:
+    """Convert any index of a batch of `count` rows to a slice or a tensor; raise the errors of `Batch.__getitem__`."""
+    refused = BadArgument("rows", show(rows), "an index, a slice, a mask of all rows or a tensor of indices")
+    if isinstance(rows, slice):
+        return rows
+    try:
+        index = rows if isinstance(rows, Tensor) else torch.as_tensor(rows)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise refused from error
+    if index.layout is not torch.strided or index.is_meta or index.ndim > 1:
+        raise refused
+    if index.dtype == torch.bool:
+        if index.shape != (count,):
+            raise refused
+        return torch.nonzero(index)[:, 0]
+    if not isinstance(rows, Tensor) and not len(index.reshape(-1)):
+        return slice(0, 0)  # an empty list
+    if index.dtype not in (torch.int64, torch.int32):  # torch takes bytes for a mask
+        raise refused
+    if index.ndim:
+        return index
+    row = range(count)[int(index)]
+    return slice(row, row + 1)
+
+
+def join(parts: Sequence[SomeBatch]) -> SomeBatch:
+    """Concatenate the rows of batches; fields without tensors are copied from the first batch."""
+    return map_tensors(lambda *tensors: torch.cat(tensors), *parts)
+
+
+def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch:
+    """Return a batch that takes each row from `new` where `choose` is True, and from `old` where it is False."""
+    return map_tensors(lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+
+
+def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
+    """Return the batch `whole` after its rows at the indices `at` are replaced by the rows of `part`."""
+    return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
+
+
+def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
+    """Return a number, or one value for each row, with axes added so that it applies to all of `like` of its row.
+
+    A value of each row has `own` axes itself.
+    """
+    if not isinstance(value, Tensor) or not value.ndim:
+        return value
+    return value.reshape(len(value), *[1] * (like.ndim - 1 - own), *value.shape[1:])
+
+
+def at_once(x: Tensor, size: int) -> int:
+    """Return how many rows of `x` to work on at once: `size` on a CPU, whose cache then holds all temporaries."""
+    return size if x.device.type == "cpu" else 256 * size  # fewer leave an accelerator idle, more fill its memory
+
+
+def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
+    """Evaluate a function on chunks of `size` rows of x, which bounds the memory; return the joined outputs."""
+    if len(x) <= size:
+        return evaluate(x)
+    return tuple(map(torch.cat, zip(*map(evaluate, x.split(size)), strict=True)))
+
+
+def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
+    """Return the indices that sort rows ascending by the first key; ties are sorted by the next key."""
+    order = torch.argsort(keys[-1], stable=True)
+    for key in reversed(keys[:-1]):
+        order = order[torch.argsort(key[order], stable=True)]
+    return order
+
+
+def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
+    """Return the rank (from 0) of each row in its group, sorted ascending by the first key, ties by the next key."""
+    order = lexical_order(group, *keys)
+    grouped = group[order].contiguous()
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(order), device=order.device) - torch.searchsorted(grouped, grouped)
+    return rank
+
+
+def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
+    """Return all tensors of a value and of the values in its fields by dotted name, such as `contacts.points`."""
+    tensors: dict[str, Tensor] = {}
+    for field in dataclasses.fields(value):  # pyright: ignore[reportArgumentType]
+        inner = getattr(value, field.name)
+        if isinstance(inner, Tensor):
+            tensors[prefix + field.name] = inner
+        elif isinstance(inner, Value):
+            tensors |= named_tensors(inner, f"{prefix}{field.name}.")
+    return tensors
+
+
+def settle(value: SomeValue, device: torch.device) -> SomeValue:
+    """Return a value moved to a device; a value that is already there is returned itself, with its caches."""
+    return value if all(x.device == device for x in named_tensors(value).values()) else value.to(device)
+
+
+def check_device(name: str, found: torch.device, beside: str, wanted: torch.device) -> None:
+    """Raise `BadArgument` unless the device `found` of argument `name` is the one `wanted` by argument `beside`."""
+    if found != wanted:
+        raise BadArgument(name, f"tensors on {found}", f"tensors on {wanted}, as {beside}: `.to` moves them")
+
+
+def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
+    """Return the number of rows with each status, as a dict that begins with the most frequent status."""
+    codes, counts = torch.unique(status, return_counts=True)
+    pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))
+    return {Status(code): count for code, count in pairs}
+
+
+def check_whole(name: str, value: Any, low: int, high: int) -> None:
+    """Raise `BadArgument` unless a value is a whole number in [low, high]."""
+    read_number(name, value, int, Range(low, high))

@@ -1,0 +1,225 @@
+"""Tasks in worker processes: a worker that hangs or dies loses only its own task."""
+
+import contextlib
+import dataclasses
+import math
+import multiprocessing
+import os
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, TimeoutError
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import reduction, spawn
+from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+import torch
+
+from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.errors import MissingExtra, NoWorkers, Status
+from torchgrasp.foundation.threads import one_thread
+
+Result = TypeVar("Result")
+Task = tuple[Any, ...]
+_starting = threading.Lock()
+
+
+@checked
+def run_tasks(
+    function: Callable[..., Result],
+    tasks: Iterable[Task],
+    workers: Annotated[int, Range(0, 1024)] = 1,
+    limit: Annotated[float, Range(0.001, math.inf)] = 60.0,
+) -> Generator[Result | Status, None, None]:
+    """Run `function(*task)` for each task in worker processes; yield the results in the order of the tasks.
+
+    Each task runs on one thread of a separate process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task
+    whose process dies twice gives `Status.WORKER_DIED`. The error of a task is raised in place of its result. All
+    workers end when the caller stops iterating. Raises `NoWorkers` if no process can start.
+
+    Each worker imports the module of the function, but not the caller's script, unless the function is of the script.
+    Tasks must hold no tensors, because processes would share them: see `pack`. If `workers` is 0, the tasks run in this
+    process, without the `limit` [s] on the time of a task.
+    """
+    return _in_order(_run(function, tasks, workers, limit))
+
+
+def run_as_they_end(
+    function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
+) -> Generator[tuple[int, Result | Status], None, None]:
+    """Run tasks like `run_tasks`, but yield the index and the result of each task as soon as it ends."""
+    with contextlib.closing(_run(function, tasks, workers, limit)) as results:
+        for number, ended in results:
+            yield number, ended if isinstance(ended, Status) else ended.result()
+
+
+def _in_order(
+    results: Generator[tuple[int, Future[Result] | Status], None, None],
+) -> Generator[Result | Status, None, None]:
+    early: dict[int, Future[Result] | Status] = {}
+    turn = 0
+    with contextlib.closing(results):
+        for number, ended in results:
+            early[number] = ended
+            while turn in early:
+                ended = early.pop(turn)
+                turn += 1
+                yield ended if isinstance(ended, Status) else ended.result()
+
+
+def _run(
+    function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
+) -> Generator[tuple[int, Future[Result] | Status], None, None]:
+    """Run the tasks; yield the index and the result of each when it ends. A broken pool of processes is replaced."""
+    if not workers:
+        for number, task in enumerate(tasks):
+            future = Future[Result]()
+            with one_thread():
+                try:
+                    future.set_result(function(*task))
+                except Exception as error:
+                    future.set_exception(error)
+            yield number, future
+        return
+    waiting, died = deque(enumerate(tasks)), set[int]()
+    broken, worked = 0, False
+    while waiting:
+        before = len(waiting)
+        yield from _run_pool(function, waiting, died, workers, limit)
+        broken = broken + 1 if len(waiting) == before else 0
+        worked = worked or not broken or bool(died)
+        if broken == 2 and not worked:
+            raise NoWorkers
+        if broken == 2:
+            broken = 0
+            yield waiting.popleft()[0], Status.WORKER_DIED
+
+
+def _run_pool(
+    function: Callable[..., Result], waiting: deque[tuple[int, Task]], died: set[int], workers: int, limit: float
+) -> Generator[tuple[int, Future[Result] | Status], None, None]:
+    """Run `waiting` tasks in one pool until all end or the pool breaks; `died` are tasks whose process died once."""
+    try:
+        from pebble import ProcessExpired, ProcessPool
+    except ImportError as error:
+        raise MissingExtra("pebble", "sim") from error
+    # The initializer imports the module of the function before the time of the first task begins.
+    own = b"__main__" in bytes(reduction.ForkingPickler.dumps(function))  # only the script has the function
+    pool = ProcessPool(
+        min(workers, len(waiting)), initializer=_begin, initargs=[function],
+        context=multiprocessing.get_context("spawn") if own else _Apart(),
+    )  # fmt: skip
+    ended = queue.SimpleQueue[int]()
+    running: dict[int, tuple[Task, Future[Result]]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < 2 * workers:
+                number, task = waiting[0]
+                try:
+                    future = pool.schedule(function, task, timeout=limit)
+                except RuntimeError:  # the pool broke
+                    return
+                running[number] = waiting.popleft()[1], future
+                future.add_done_callback(lambda _, number=number: ended.put(number))
+            try:
+                number = ended.get(timeout=1.0)  # a broken pool may never end some tasks
+            except queue.Empty:
+                if pool.active:
+                    continue
+                return
+            error = running[number][1].exception()
+            if isinstance(error, BrokenProcessPool):
+                return
+            task, future = running.pop(number)
+            if isinstance(error, ProcessExpired) and number not in died:
+                died.add(number)  # a machine short of memory may kill any process: try once more, first
+                waiting.appendleft((number, task))
+            elif isinstance(error, ProcessExpired):
+                yield number, Status.WORKER_DIED
+            else:
+                yield number, Status.TIMED_OUT if isinstance(error, TimeoutError) else future
+    finally:
+        waiting.extendleft((number, task) for number, (task, _) in sorted(running.items(), reverse=True))
+        pool.stop()
+        with contextlib.suppress(TimeoutError):  # a signal can leave pebble's threads waiting for each other
+            pool.join(10.0)
+
+
+class _Process(SpawnProcess):
+    """A process that does not run the caller's script, which would begin the work anew where it has no guard."""
+
+    def start(self) -> None:
+        """Start the process without the name of the script."""
+        with _starting:
+            known = spawn.get_preparation_data
+            spawn.get_preparation_data = lambda name: {k: x for k, x in known(name).items() if k[:9] != "init_main"}
+            try:
+                super().start()
+            finally:
+                spawn.get_preparation_data = known
+
+
+class _Apart(SpawnContext):
+    """The way in which `_Process` starts."""
+
+    Process = _Process
+
+
+def _begin(function: Callable[..., Any]) -> None:
+    """Prepare a worker process: it uses one torch thread, and it ends when its parent process ends."""
+    torch.set_num_threads(1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+class _Packed(NamedTuple):
+    """A tensor as array with the name of its device, or the attributes of a dataclass, cached ones among them."""
+
+    kind: type | str
+    content: Any
+
+
+def pack(value: Any, known: dict[int, Any] | None = None) -> Any:
+    """Return a value for another process: arrays in place of tensors, which processes would share; see `unpack`.
+
+    `known` holds by identity what was packed before, so that what a value holds twice is sent once.
+    """
+    known = {} if known is None else known
+    if id(value) in known:
+        return known[id(value)]
+    if isinstance(value, torch.Tensor):
+        packed = known[id(value)] = _Packed(str(value.device), value.detach().cpu().numpy())
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        packed = known[id(value)] = _Packed(type(value), pack(vars(value), known))
+    else:
+        packed = _map_items(lambda item: pack(item, known), value)
+    return packed
+
+
+def unpack(packed: Any) -> Any:
+    """Return the value that `pack` packed, with its tensors on their devices."""
+    if not isinstance(packed, _Packed):
+        return _map_items(unpack, packed)
+    if isinstance(packed.kind, str):
+        return torch.from_numpy(packed.content).to(torch.device(packed.kind))
+    value = object.__new__(packed.kind)
+    vars(value).update(unpack(packed.content))
+    return value
+
+
+def _map_items(function: Callable[[Any], Any], value: Any) -> Any:
+    """Return a dictionary, list or tuple with the results of a function of its items; another value as it is."""
+    if isinstance(value, dict):
+        return {key: function(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        items = map(function, value)
+        return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
+    return value

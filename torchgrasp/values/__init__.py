@@ -1,0 +1,1 @@
+"""The values that pass between folders: clouds, contacts, grasps; closings; and the options of users."""
